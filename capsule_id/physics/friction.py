@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,6 @@ import numpy as np
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module
 from capsule_id.precision import require_float64
-
-if TYPE_CHECKING:
-    from capsule_id.physics.model import CapsuleParameters
-
 
 # series: Polynomials in the scaled time s of a Taylor step: lists of coefficients, one array (L,) per order.
 #
@@ -186,8 +182,8 @@ def normal_force(m1: Any, m2: Any, g: Any, slope: Any = None, N0: Any = None) ->
     return N if N0 is None else N + N0
 
 
-def friction_law(p: "CapsuleParameters", friction: FrictionLaw | None = None) -> FrictionLaw:
-    """``friction``, or eq. (1) with the capsule's parameters and weight."""
+def friction_law(p: Any, friction: FrictionLaw | None = None) -> FrictionLaw:
+    """``friction``, or eq. (1) with the parameters and weight of the capsule p, a ``CapsuleParameters``."""
     if friction is not None:
         return friction
     own = {row.symbol: getattr(p, row.symbol) for row in CoulombStribeck.parameters if row.symbol != "N"}

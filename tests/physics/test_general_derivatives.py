@@ -42,7 +42,7 @@ def directions(e: Any) -> list[tuple[str, CapsuleParameters, Any]]:
     nothing = jax.tree.map(lambda x: np.zeros_like(np.asarray(x, float)), (P, e))
     found = []
     for owner in (0, 1):
-        for field in fields((P, e)[owner]):
+        for field in (field for field in fields((P, e)[owner]) if field.name != "forces"):
             value = np.asarray(getattr((P, e)[owner], field.name), float)
             # Of a record every sample moves; of its times only those within.
             moved = rng.standard_normal(value.shape) * (0.02 if field.name == "times" else 1.0) if value.ndim else 1.0
