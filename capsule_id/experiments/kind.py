@@ -6,7 +6,7 @@ from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -147,8 +147,6 @@ BUILT_IN = (
     "progression",
 )
 
-Declared = TypeVar("Declared")
-
 
 @dataclass(frozen=True, eq=False)
 class Registry(Mapping[str, Kind]):
@@ -211,7 +209,7 @@ class Registry(Mapping[str, Kind]):
         return len(self.kinds)
 
 
-def _joined(what: str, declared: Iterable[tuple[str, Mapping[str, Declared]]]) -> dict[str, Declared]:
+def _joined(what: str, declared: Iterable[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
     """Everything that the kinds declare, by name; ``declared`` holds pairs of a kind's name and its declarations.
 
     Raises
@@ -219,7 +217,7 @@ def _joined(what: str, declared: Iterable[tuple[str, Mapping[str, Declared]]]) -
     ValueError
         If two kinds declare the same name differently.
     """
-    joined: dict[str, Declared] = {}
+    joined: dict[str, Any] = {}
     for kind, own in declared:
         for name, value in own.items():
             if joined.setdefault(name, value) != value:

@@ -75,10 +75,8 @@ MESSAGES = {
 
 def line_estimates(experiments: Sequence["Line"]) -> Values:
     """Return the slopes of ordinary straight lines, by name; the mean over tables."""
-    slopes: dict[str, list[float]] = {}
-    for e in experiments:
-        slopes.setdefault(e.slope.name, []).append(e.ordinary_line()[0])
-    return {name: float(np.mean(values)) for name, values in slopes.items()}
+    slopes = [(e.slope.name, e.ordinary_line()[0]) for e in experiments]
+    return {name: float(np.mean([slope for own, slope in slopes if own == name])) for name, _ in slopes}
 
 
 def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
@@ -114,18 +112,16 @@ SMALLEST_DEVIATION = 0.5
 
 def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
     """Check that the means of repeated readings lie on the line (F test; Draper & Smith 1998, section 2.1)."""
-    judged, findings = 0, []
+    tests = []
     for e in lines:
         keep = np.setdiff1d(np.arange(e.n), fit.flagged.get(e.label, []))
-        found = lack_of_fit(e.x[keep], e.y[keep])
-        if found is None:
-            continue
-        judged += 1
-        deviation, p = found
-        if p * len(lines) < LEVEL and deviation > SMALLEST_DEVIATION:
-            facts = {"name": e.slope.name, "x": e.x_name, "deviation": deviation, "p": p}
-            findings.append(Finding("lines.replicates", "fail", facts, e.label))
-    return findings or [Finding("lines.replicates", "ok", {"number": judged})] * bool(judged)
+        tests += [(e, *found) for found in [lack_of_fit(e.x[keep], e.y[keep])] if found is not None]
+    findings = [
+        Finding("lines.replicates", "fail", {"name": e.slope.name, "x": e.x_name, "deviation": size, "p": p}, e.label)
+        for e, size, p in tests
+        if p * len(lines) < LEVEL and size > SMALLEST_DEVIATION
+    ]
+    return findings or [Finding("lines.replicates", "ok", {"number": len(tests)})] * bool(tests)
 
 
 def lack_of_fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
@@ -234,7 +230,8 @@ def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
         if fit.flagged:
             without = refit(e, theta, left_out)[e.symbol] if left_out else (np.nan, np.nan)
             row |= {"without flagged rows": without[0], "± without": without[1]}
-        rows.append(row | e.table_extras() | {"errors": e.errors})
+        length = getattr(e.table.settings, "length", None)
+        rows.append(row | ({} if length is None else {"length, m": length.value}) | {"errors": e.errors})
     return [ResultTable("lines.slopes", pd.DataFrame(rows).set_index("table"))]
 
 
@@ -312,10 +309,6 @@ class Line(PointTest):
         if self.sd_ratio is not None:
             return "errors in both columns, their ratio as stated, their size estimated"
         return "one total scatter about the line (the reading errors of both columns are not stated)"
-
-    def table_extras(self) -> dict[str, float]:
-        """Additional columns of the table of calibration lines, name with unit -> number."""
-        return {}
 
     def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
         return theta[self.symbol] * x[self.x_name]

@@ -123,7 +123,7 @@ def cantilever_exponent(
 
 def check_cantilever(springs: "Sequence[SupportSpring]", fit: Fitted) -> list[Finding]:
     """Check k2 ~ L^-3 over the springs, where lengths are stated."""
-    pairs = [(e, e.length) for e in springs if e.length is not None]
+    pairs = [(e, e.table.settings.length) for e in springs if e.table.settings.length is not None]
     if len({e.slope.name for e, _ in pairs}) < 2:
         return []
     estimates = [refit(e, e.local(fit.values), fit.flagged.get(e.label, []))["k2"] for e, _ in pairs]
@@ -150,11 +150,3 @@ class SupportSpring(Line):
 
     def slope_of(self, table: Table) -> Parameter:
         return parameter(self.symbol, table.settings.spring)
-
-    @property
-    def length(self) -> Quantity | None:
-        """Free length of the cantilever, m, where stated."""
-        return self.table.settings.length
-
-    def table_extras(self) -> dict[str, float]:
-        return {} if self.length is None else {"length, m": self.length.value}
