@@ -121,6 +121,6 @@ class FreeVibration(DecayRecord):
         return nested_starts(self)
 
     def noise_facts(self) -> Facts:
-        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines}
+        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.lines}
         facts |= {"tone": other_tone(self.time, self.values)}
         return {"model": "decay", "stated": self.stated_words, **facts, **self.damping_trend(), **later_start(self)}

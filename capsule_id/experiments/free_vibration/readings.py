@@ -330,27 +330,12 @@ class DecayModel:
             settings.thin or 1,
         )
 
-    @property
-    def lines(self) -> str:
-        """Lines of ``rig.toml`` that state the model."""
-        return f'{self.force_lines}, drift = "{self.drift}", noise = "{self.noise}", thin = {self.thin}'
-
-    @property
-    def force_lines(self) -> str:
-        """Lines of ``rig.toml`` that state the forces."""
-        return f"{self.damping_line}, {self.stiffness_line}"
-
-    @property
-    def damping_line(self) -> str:
-        """Line of ``rig.toml`` that states the damping."""
+    def lines(self, *keys: str) -> str:
+        """Lines of ``rig.toml`` that state these ``keys`` of the model."""
         words = ", ".join(f'"{word}"' for word in ("viscous", *self.damping))
-        return f"damping = [{words}]"
-
-    @property
-    def stiffness_line(self) -> str:
-        """Line of ``rig.toml`` that states the spring."""
-        word = "cubic" if self.cubic else "linear"
-        return f'stiffness = "{word}"'
+        values = {"damping": f"[{words}]", "stiffness": '"cubic"' if self.cubic else '"linear"'}
+        values |= {"drift": f'"{self.drift}"', "noise": f'"{self.noise}"', "thin": str(self.thin)}
+        return ", ".join(f"{key} = {values[key]}" for key in keys)
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -361,10 +346,6 @@ class DecayModel:
         """Return the model with one further force."""
         words = tuple(word for word, own in DAMPING.items() if own in (*self.symbols, symbol))
         return replace(self, damping=words, cubic=self.cubic or symbol == "k_cubic")
-
-    def line_of(self, symbol: str) -> str:
-        """Line of ``rig.toml`` that states the force with this parameter."""
-        return self.stiffness_line if symbol == "k_cubic" else self.damping_line
 
     @property
     def absent(self) -> tuple[str, ...]:

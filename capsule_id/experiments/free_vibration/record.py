@@ -291,7 +291,7 @@ class Decay(SurfaceExperiment):
     @property
     def lines(self) -> str:
         """Lines of ``rig.toml`` that state the model."""
-        return self.model.lines
+        return self.model.lines(*CHOICES, "thin")
 
     @property
     def replaced(self) -> bool:

@@ -165,11 +165,8 @@ LINEAR, OWN = ("F_dry", "c_q", "k_cubic", "turning_time"), ("amplitude", "turnin
 
 def free_symbols(model: DecayModel) -> list[str]:
     """Unknowns of ``model`` among ``NAMES``."""
-    absent = {"F_dry", "c_q", "k_cubic"} - set(model.symbols)
-    absent |= {"white_ratio"} if model.noise != "arma" else set()
-    absent |= {"noise_time"} if model.noise == "white" else set()
-    absent |= {"drift_ratio", "drift_time"} if model.drift != "gp" else set()
-    return [name for name in NAMES if name not in absent]
+    known = ("k1", "c", "amplitude", "turning_time", *model.symbols, *model.shapes)
+    return [name for name in NAMES if name in known]
 
 
 # Three programs compile faster than one, and the first serves records of every length.

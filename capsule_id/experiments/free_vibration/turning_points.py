@@ -235,7 +235,8 @@ def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Level] | N
         return None
     best = max(found, key=lambda one: one.z)
     facts = {"name": best.symbol, "value": best.value, "unit": parameter(best.symbol).unit, "z": best.z}
-    facts |= {"line": best.model.line_of(best.symbol), "model": e.model.name, "one_side": not e.both_sides}
+    key = "stiffness" if best.symbol == "k_cubic" else "damping"
+    facts |= {"line": best.model.lines(key), "model": e.model.name, "one_side": not e.both_sides}
     return facts, "ok" if best.z <= DISAGREE else "fail" if best.z > FAIL and best.moved else "warn"
 
 
@@ -364,7 +365,7 @@ class TurningPoints(Decay):
 
     @property
     def lines(self) -> str:
-        return self.model.force_lines
+        return self.model.lines("damping", "stiffness")
 
     @classmethod
     def second_models(
