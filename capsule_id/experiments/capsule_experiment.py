@@ -83,16 +83,6 @@ class CapsuleForward(GroundExperiment):
         self.reaction = rig.model.share_of_reaction
 
     @property
-    def excitation_period(self) -> float | None:
-        """s; None where nothing excites the capsule periodically."""
-        return None
-
-    @property
-    def cycles(self) -> np.ndarray | None:
-        period = self.excitation_period
-        return None if period is None else self.table["time"] / period
-
-    @property
     def masses(self) -> tuple[str, ...]:
         return ("m1", "m2")
 
@@ -176,6 +166,11 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     @property
     def model_name(self) -> str:
         return "capsule model"
+
+    @property
+    def cycles(self) -> Any:
+        """None: the capsule takes energy when it slips, so that no period repeats."""
+        return None
 
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
         p = self.parameters_of(theta, theta.get("k2", 0.0), theta["G"] if self.gap is None else self.gap)

@@ -7,8 +7,7 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.forced_run.drives import ForcedRun
-from capsule_id.experiments.forced_run.experiment import growth
+from capsule_id.experiments.forced_run.experiment import CapsuleRun, growth
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives import Pulses, RecordedDrive
 from capsule_id.physics.model import CapsuleParameters, simulate
@@ -45,12 +44,12 @@ def write(folder: Path, drive: Drive, shift: float, current: np.ndarray | None, 
     (folder / "rig.toml").write_text(HEAD + RUN + settings)
 
 
-def run_of(folder: Path) -> ForcedRun:
+def run_of(folder: Path) -> CapsuleRun:
     (run,) = make_experiments(read_rig(folder))
     return run
 
 
-def largest_residual(run: ForcedRun, own: dict[str, float]) -> float:
+def largest_residual(run: CapsuleRun, own: dict[str, float]) -> float:
     """Largest rms residual of a channel at the truth with ``own``, in units of the noise."""
     start = {"x_start": 0.0, "y_start": 0.0, "noise_x_rel": NOISE, "noise_x_capsule": NOISE}
     records = run.records({**TRUTH, **start, **own})

@@ -233,7 +233,6 @@ def check_repeated(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
 
 def repetition(run: CapsuleRun, residuals: Float[np.ndarray, " n"]) -> tuple[float, float] | None:
     """F statistic of the harmonics of the excitation in ``residuals``, and its p-value; None for a short record."""
-    assert run.cycles is not None, "a run has an excitation"
     cycles = run.cycles
     periods = float(cycles[-1] - cycles[0])
     number = min(HARMONICS, int(len(cycles) / periods / SAMPLES_PER_HARMONIC))

@@ -293,8 +293,8 @@ class CapsuleRun(CapsuleForward):
         return self.about.record
 
     @property
-    def excitation_period(self) -> float | None:
-        return 2.0 * np.pi / self.Omega
+    def cycles(self) -> np.ndarray:
+        return self.table["time"] / (2.0 * np.pi / self.Omega)
 
     @property
     def rough(self) -> RunStart:

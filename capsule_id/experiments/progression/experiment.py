@@ -419,6 +419,7 @@ class Progression(CapsuleForward):
         centre: np.ndarray,
         limits: tuple[np.ndarray | None, np.ndarray | None],
         label: str,
+        residuals: np.ndarray | None = None,
     ) -> tuple[Comparison, ...]:
         """One panel per duty and amplitude of ``settings`` (rows, 4): mean velocity against period, and the trials there.
 
@@ -426,18 +427,16 @@ class Progression(CapsuleForward):
         ----------
         centre, limits : (rows,) mean velocity and the limits of its band, mm/s
         label : of the curve
+        residuals : (n,) of the trials, in units of the noise; None: not shown
         """
         speed, panels = 1e3 / self.time, []
-        for group in _groups(settings):
+        period = self.setting @ (1e3 * self.settings[:, 0])
+        for group in np.unique(settings[:, 2:], axis=0):
             own = np.flatnonzero(np.all(settings[:, 2:] == group, axis=1))
             own = own[np.argsort(settings[own, 0], kind="stable")]
             lower, upper = (None if limit is None else limit[own] for limit in limits)
-            rows = self._rows_of(group)
-            trials = Points(
-                self.label,
-                (self.setting @ (1e3 * self.settings[:, 0]))[rows],
-                (self.distance * (self.setting @ speed))[rows],
-            )
+            rows = np.flatnonzero(self.setting[:, np.all(self.settings[:, 2:] == group, axis=1)].any(axis=1))
+            trials = Points(self.label, period[rows], (self.distance * (self.setting @ speed))[rows])
             amplitude = {"column": f", {group[1]:g} N", "current": f", {group[1]:g} A"}.get(self.amplitude_from, "")
             duty = f", duty {100.0 * group[0]:g} %" if self.drive == "pulses" else ""
             panels.append(
@@ -449,14 +448,11 @@ class Progression(CapsuleForward):
                     "mean velocity [mm/s]",
                     (trials,) if len(rows) else (),
                     (Curve(label, 1e3 * settings[own, 0], centre[own], lower, upper),),
+                    None if residuals is None else period[rows],
+                    None if residuals is None else residuals[rows],
                 )
             )
         return tuple(panels)
-
-    def _rows_of(self, group: np.ndarray) -> np.ndarray:
-        """Rows of the trials with the duty and amplitude of ``group``."""
-        own = np.flatnonzero(np.all(self.settings[:, 2:] == group, axis=1))
-        return np.flatnonzero(self.setting[:, own].any(axis=1))
 
     def densities_of_settings(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
         """(draws, settings) log-density of the readings of each setting given the parameters and all others."""
@@ -491,20 +487,9 @@ class Progression(CapsuleForward):
         centre = np.asarray(self.displacements(theta, np.zeros(len(settings)), settings)) * speed
         chosen = draws[:: max(1, len(draws) // BAND_DRAWS)]
         trials = self.new_trials(chosen, settings, np.random.default_rng(BAND_SEED)) if chosen else np.empty((0, 0))
-        lower, upper = band(trials * speed if chosen else trials)
-        panels = self.speed_panels(settings, centre, (lower, upper), "this fit, 95 % band of a new trial")
+        limits = band(trials * speed if chosen else trials)
         residuals = np.asarray(self.residuals(theta, np))[: self.n]
-        rows = [self._rows_of(group) for group in _groups(settings)]
-        period = self.setting @ (1e3 * settings[:, 0])
-        return tuple(
-            replace(panel, residual_x=period[own], residuals=residuals[own])
-            for panel, own in zip(panels, rows, strict=True)
-        )
-
-
-def _groups(settings: np.ndarray) -> np.ndarray:
-    """(groups, 2) duty and amplitude."""
-    return np.unique(settings[:, 2:], axis=0)
+        return self.speed_panels(settings, centre, limits, "this fit, 95 % band of a new trial", residuals)
 
 
 @eqx.filter_jit
