@@ -16,8 +16,7 @@ from capsule_id.records.release import find_free_decay
 from capsule_id.records.tones import estimate_clock
 from capsule_id.rig.filters import clock_starts, dominant_frequency
 from capsule_id.rig.formats.layouts import delimiter_of
-from capsule_id.rig.formats.raw import Layout
-from capsule_id.rig.formats.text import TextFile
+from capsule_id.rig.formats.raw import Layout, TextFile
 from capsule_id.rig.guess import (
     FEWEST_SAMPLES,
     TIME,

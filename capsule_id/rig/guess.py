@@ -16,8 +16,8 @@ from capsule_id.errors import InputError
 from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, suffix_of
 from capsule_id.rig.formats.layouts import delimiter_of, is_number
-from capsule_id.rig.formats.raw import Export, Layout
-from capsule_id.rig.formats.text import COMPRESSED, TextFile, bare, cells_of, is_row
+from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile
+from capsule_id.rig.formats.text import bare, cells_of, is_row
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
 

@@ -12,20 +12,18 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Content, Export, Layout, Place, refuse_line
+from capsule_id.rig.formats.raw import Content, Export, Layout, Place, TextFile, occurrences, refuse_line
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Rows,
     Shape,
-    TextFile,
     any_rows,
     bare,
     cells_of,
     is_comment,
     is_row,
     number_in,
-    occurrences,
     place_of_cell,
     plain_rows,
     plain_table,
