@@ -16,8 +16,7 @@ from capsule_id.records.release import find_free_decay
 from capsule_id.records.tones import estimate_clock
 from capsule_id.rig.filters import clock_starts, dominant_frequency
 from capsule_id.rig.formats.layouts import delimiter_of
-from capsule_id.rig.formats.raw import Layout
-from capsule_id.rig.formats.text import TextFile
+from capsule_id.rig.formats.raw import Layout, TextFile
 from capsule_id.rig.guess import (
     FEWEST_SAMPLES,
     TIME,
@@ -529,7 +528,9 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
         lines += _channel(found, index, dimensions, time is not None)
     if len(found.columns) > _SHOWN_COLUMNS:
         lines.append(counted(len(found.columns) - _SHOWN_COLUMNS, "more column"))
-    lines += _rows(found, rows)
+    for row in [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]:
+        cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
+        lines.append(f"line {found.export.lines[row]}: {'  '.join(cells)}")
     text, _ = entry_of(content, path, path.name, kinds)
     return [*lines, "", text.rstrip()]
 
@@ -610,11 +611,3 @@ def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record
             if len(rows):
                 faults.append(f"{counted(len(rows), what)}, the first in line {found.export.lines[rows[0]]}")
     yield "; ".join([line, *faults])
-
-
-def _rows(found: FoundLayout, rows: int) -> Iterable[str]:
-    """The first and last rows of numbers."""
-    shown = [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]
-    for row in shown:
-        cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
-        yield f"line {found.export.lines[row]}: {'  '.join(cells)}"

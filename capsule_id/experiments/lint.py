@@ -21,7 +21,7 @@ from capsule_id.records.faults import (
 )
 from capsule_id.records.tones import frequency_of
 from capsule_id.rig.filters import TIMING_TOLERANCE, hampel_outliers, largest_offset, median_step
-from capsule_id.rig.formats.text import WINDOWS
+from capsule_id.rig.formats.raw import WINDOWS
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import RIG_QUANTITIES, ColumnRule, GroundSettings, QuantityRule
 from capsule_id.rig.units import factor_to_si

@@ -16,8 +16,8 @@ from capsule_id.errors import InputError
 from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, suffix_of
 from capsule_id.rig.formats.layouts import delimiter_of, is_number
-from capsule_id.rig.formats.raw import Export, Layout
-from capsule_id.rig.formats.text import COMPRESSED, TextFile, bare, cells_of, is_row
+from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile
+from capsule_id.rig.formats.text import bare, cells_of, is_row
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
 
@@ -184,7 +184,7 @@ def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:
 MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "#N/A", "?")
 #: Largest share of missing readings in a column of readings.
 MOST_MISSING = 0.5
-_BEGINNING = 100_000  # characters in which the first row of readings is searched
+_BEGINNING = 100_000  # bytes in which the first row of readings is searched
 _MOST_TITLES = 100  # lines
 #: Separator and number of cells of a line whose first cell is a number; None for any other line.
 Cells = tuple[str | None, int] | None
@@ -327,14 +327,9 @@ def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layo
 
 
 def _beginning(file: TextFile) -> bytes:
-    """The first lines of a text in UTF-8, about ``_BEGINNING`` characters."""
-    lines, size = [], 0
-    for line in file.lines():
-        size += len(line) + 1
-        if lines and size > _BEGINNING:
-            break
-        lines.append(line)
-    return "\n".join([*lines, ""]).encode()
+    """The first lines of a text in UTF-8, about ``_BEGINNING`` bytes."""
+    text = next(file.blocks(), (0, b""))[1]
+    return text[: text.rfind(b"\n", 0, _BEGINNING) + 1 or text.find(b"\n") + 1]
 
 
 def _text_layout(beginning: bytes, path: Path) -> Layout:

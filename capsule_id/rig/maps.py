@@ -420,29 +420,37 @@ class _Part:
 
 def _selected_by(parts: Sequence[_Part], node: Node, wanted: Wanted) -> tuple[np.ndarray, np.ndarray]:
     """The rows whose column, named by the key of ``node``, has what is ``wanted``, and those without a value, (n,)."""
-    key = node.key
+    key, is_text = node.key, isinstance(wanted, str)
     stated = any(key in row for part in parts for export in part.exports for row in export.headers)
     number = key.isascii() and key.isdigit() and int(key) > 0 and not stated
     header: Header = int(key) if number else " ".join(key.split())
-    text, remedy = shown(wanted) if isinstance(wanted, str) else str(wanted), "write one of the values of the column"
+    found = [part.words(node, header) if is_text else part.find(node, header)[0] for part in parts]
+    column = np.concatenate(found)
     if isinstance(wanted, str):
-        column = np.concatenate([part.words(node, header) for part in parts])
         rows, unknown = column == wanted, column == ""
-        holds = [shown(str(text)) for text in np.unique(column)]
     else:
-        column = np.concatenate([part.find(node, header)[0] for part in parts])
         # 0.1 + 0.2 is 0.3; times since 1970 in microseconds keep their digits.
         ends = np.array([wanted.min, wanted.max])
         low, high = ULPS * np.array([-1, 1]) * np.spacing(np.where(np.isfinite(ends), np.abs(ends), 0.0)) + ends
         rows, unknown = (column >= low) & (column <= high), np.isnan(column)
-        numbers = np.unique(column[~unknown])
-        holds = [f"{value:.15g}" for value in numbers[: _MOST_VALUES + 1]]
-        if wanted.is_range:
-            remedy, holds = "widen the range", [f"{numbers[0]:.15g} to {numbers[-1]:.15g}"] if numbers.size else []
     if not rows.any():
-        seen = " ".join(holds[:_MOST_VALUES]) + (" …" if len(holds) > _MOST_VALUES else "")
-        raise node.error(f"where must keep a row; column {shown(key)} holds {seen or 'no number'}", text, remedy)
+        raise node.error(
+            f"where must keep a row; column {shown(key)} holds {_held(column, wanted)}",
+            shown(wanted) if is_text else str(wanted),
+            "widen the range"
+            if isinstance(wanted, Range) and wanted.is_range
+            else "write one of the values of the column",
+        )
     return rows, unknown
+
+
+def _held(column: np.ndarray, wanted: Wanted) -> str:
+    """What a column, (n,) texts or numbers, holds where nothing is ``wanted``, in words."""
+    seen = np.unique(column if isinstance(wanted, str) else column[~np.isnan(column)])
+    if isinstance(wanted, Range) and wanted.is_range and seen.size:
+        return f"{seen[0]:.15g} to {seen[-1]:.15g}"
+    texts = [shown(str(one)) if isinstance(wanted, str) else f"{one:.15g}" for one in seen[: _MOST_VALUES + 1]]
+    return " ".join(texts[:_MOST_VALUES]) + " …" * (len(texts) > _MOST_VALUES) or "no number"
 
 
 def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.ndarray:

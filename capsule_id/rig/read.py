@@ -14,7 +14,7 @@ import numpy as np
 from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import Parameter, Prior
-from capsule_id.rig.formats.text import TextFile
+from capsule_id.rig.formats.raw import TextFile
 from capsule_id.rig.maps import MAP_KEYS
 from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import (

@@ -14,8 +14,8 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import FEWEST_PERIODS, clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
-from capsule_id.rig.formats.raw import Layout, Place, RawTable
-from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError, TextFile
+from capsule_id.rig.formats.raw import Layout, Place, RawTable, TextFile
+from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError
 from capsule_id.rig.guess import find_layout, proposal
 from capsule_id.rig.maps import apply_map, on_reference, read_clock, read_map
 from capsule_id.rig.model import NO_DRIFT, Column, Quantity, S, Table

@@ -101,11 +101,6 @@ class TomlDocument:
             path = path[:-1]
         return 1, 1
 
-    def error(self, path: KeyPath, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
-        """The error about the value (or key) at ``path``."""
-        line, column = self.place(path, of_key)
-        return InputError(rule, value, remedy, self.path, line, column)
-
 
 def parse_toml(text: str, path: Path) -> TomlDocument:
     """Parse ``text`` (line ends ``\\n``) and locate every key and value.
@@ -335,7 +330,7 @@ class Node:
 
     def error(self, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
         """The error about the value, or about its key."""
-        return self.document.error(self.path, rule, value, remedy, of_key)
+        return InputError(rule, value, remedy, self.document.path, *self.document.place(self.path, of_key))
 
     def require(self, holds: bool, rule: str, remedy: str) -> None:
         """Raise where the value does not hold; ``rule`` continues "<key> must ..."."""

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.text import Shape, TextFile, _read_cells, plain_block, read_csv
+from capsule_id.rig.formats.raw import TextFile
+from capsule_id.rig.formats.text import Shape, _read_cells, plain_block, read_csv
 
 DIALECTS = [
     (delimiter, decimal, ending, mark)

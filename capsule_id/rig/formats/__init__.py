@@ -9,8 +9,8 @@ from pathlib import Path
 
 from capsule_id.rig.formats.binary import read_hdf5, read_mat, read_npz, read_parquet, read_tdms, read_xlsx
 from capsule_id.rig.formats.layouts import read_lvm, read_text
-from capsule_id.rig.formats.raw import Content, Export, Layout, RawTable
-from capsule_id.rig.formats.text import COMPRESSED, read_csv
+from capsule_id.rig.formats.raw import COMPRESSED, Content, Export, Layout, RawTable
+from capsule_id.rig.formats.text import read_csv
 
 _TEXTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
     ".csv": read_text,

@@ -12,20 +12,18 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Content, Export, Layout, Place, refuse_line
+from capsule_id.rig.formats.raw import Content, Export, Layout, Place, TextFile, occurrences, refuse_line
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Rows,
     Shape,
-    TextFile,
     any_rows,
     bare,
     cells_of,
     is_comment,
     is_row,
     number_in,
-    occurrences,
     place_of_cell,
     plain_rows,
     plain_table,
@@ -79,14 +77,11 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
 
     lines = rows.lines
 
-    def values(column: int) -> np.ndarray:
-        return rows.column(column)
-
     def place(row: int | None, column: int) -> Place:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    return Export(path, headers, width, lines, values, place, file.encoding, rows.words)
+    return Export(path, headers, width, lines, rows.column, place, file.encoding, rows.words)
 
 
 def _file(content: Content, path: Path, layout: Layout) -> TextFile:

@@ -13,10 +13,10 @@ from capsule_id.api import read_rig
 from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.rig.formats import EXPORTS, READERS
-from capsule_id.rig.formats import text as blocks
+from capsule_id.rig.formats import raw as blocks
 from capsule_id.rig.formats import text as rows
-from capsule_id.rig.formats.raw import Layout
-from capsule_id.rig.formats.text import Shape, TextFile, plain_block
+from capsule_id.rig.formats.raw import Layout, TextFile
+from capsule_id.rig.formats.text import Shape, plain_block
 
 #: Texts with every layout and every fault that depends on more than one line.
 TEXTS = [
