@@ -231,7 +231,9 @@ def run(args: argparse.Namespace) -> int:
     free = frozenset(_frequency_leaf(args) if axis.name == "f" else axis.name for axis in axes)
     # The posterior supplies k2.
     values = capsule_values(args, FIG_6_DEFAULTS, free | ({"k2"} if args.posterior is not None else set()))
-    out = args.out if args.out is not None else _default_out(rig.name if rig is not None else None, axes)
+    names = "-".join(axis.name for axis in axes)
+    default = Path(f"bifurcation-{names}.nc") if rig is None else Path("results") / f"{rig.name}-{names}.nc"
+    out = default if args.out is None else args.out
     store = prepare_store(out, args.resume)
     prepare_jax(not args.no_cache)
     from capsule_id.physics.forces import warn_of_far_gap
@@ -408,19 +410,15 @@ def _whole_number(name: str, text: str) -> int:
     return int(value)
 
 
-def _default_out(rig: str | None, axes: Sequence[Axis]) -> Path:
-    names = "-".join(axis.name for axis in axes)
-    return Path("results") / f"{rig}-{names}.nc" if rig is not None else Path(f"bifurcation-{names}.nc")
-
-
 def _summary_text(data: "xr.Dataset", axes: Sequence[Axis], out: Path) -> str:
     """The result in one line or two."""
+    wrote = f"wrote {out} and {out.with_suffix('.png')}"
     if "probability" in data:
         axis, (low, middle, high) = axes[0], data["chosen_mean_velocity_quantiles"].to_numpy() * 1e3
         best = float(data["chosen"]) / axis.factor
         found = f"best in the mean of {data.attrs['draws']} draws: {axis.name} = {best:.4g} {axis.unit}, "
-        return f"{found}{middle:.3g} mm/s (95 %: {low:.3g} to {high:.3g})\nwrote {out} and {out.with_suffix('.png')}"
+        return f"{found}{middle:.3g} mm/s (95 %: {low:.3g} to {high:.3g})\n{wrote}"
     label = data["label"].to_numpy().ravel()
     failed, kinds = int((label == "failed").sum()), len(set(label.tolist()) - {"failed"})
     failures = f", {counted(failed, 'run')} failed (see status)" if failed else ""
-    return f"{counted(label.size, 'motion')} of {counted(kinds, 'kind')}{failures}\nwrote {out} and {out.with_suffix('.png')}"
+    return f"{counted(label.size, 'motion')} of {counted(kinds, 'kind')}{failures}\n{wrote}"

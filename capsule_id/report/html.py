@@ -214,6 +214,7 @@ def _unique(labels: Iterable[str]) -> list[str]:
 
 
 _TEMPLATES = Path(__file__).with_name("templates")
+_WHOLE_FIT: tuple[Section, ...] = ("sample", "point_fit")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
 #: Largest number of figures of experiments that are open at first; those of the sample and the point fit add 3.
 MOST_OPEN = 9
@@ -225,6 +226,8 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
     messages = messages_of(result.registry)
     stated_last = sorted(table_rows(result.summary), key=lambda row: is_stated(row.name))
     worst_first = sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
+    # Narrow pictures go in pairs, and a wide one between them leaves a gap.
+    narrow_first = sorted(pictures, key=lambda picture: picture.wide)
     titles = {finding.code: title_of(finding.code, messages) for finding in result.findings}
     return (
         _environment()
@@ -234,8 +237,8 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
             answers=[(row, _truth(row, result.truth.get(row.name))) for row in stated_last],
             steps=next_steps(result),
             skewed=skewed_names(result.summary),
-            experiments=_experiments(result, pictures),
-            sections={name: _section(pictures, name) for name in ("sample", "point_fit")},
+            experiments=_experiments(result, [picture for picture in pictures if picture.section == "measured"]),
+            sections={name: [picture for picture in narrow_first if picture.section == name] for name in _WHOLE_FIT},
             parameters=printed_table(result.summary, "html"),
             nuisances=printed_table(result.nuisances, "html"),
             checks=_checks(result.findings, titles),
@@ -267,12 +270,11 @@ def _truth(row: Row, truth: float | None) -> str:
     return known
 
 
-def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, object]]:
+def _experiments(result: Result, measured: Sequence[Picture]) -> list[dict[str, object]]:
     """One entry per experiment: label, worst level of its findings, pictures, whether it is open at first.
 
     Experiments with a failure or a warning are open, as long as fewer than ``MOST_OPEN`` figures are.
     """
-    measured = [picture for picture in pictures if picture.section == "measured"]
     shared = {picture.group for picture in measured}.difference(table.label for table in result.rig.tables)
     named: dict[str, Level] = {}
     for level in reversed(_WORST_FIRST):
@@ -311,11 +313,6 @@ def _environment() -> Environment:
         "after_number": after_number,
     }
     return environment
-
-
-def _section(pictures: Sequence[Picture], name: str) -> list[Picture]:
-    """Narrow pictures first: they go in pairs, and a wide one between them leaves a gap."""
-    return sorted((picture for picture in pictures if picture.section == name), key=lambda picture: picture.wide)
 
 
 def _checks(findings: Sequence[Finding], titles: Mapping[str, str]) -> list[tuple[str, Level, int]]:

@@ -441,7 +441,13 @@ def corner(columns: SampledParameters, ax: Axes) -> None:
     _marks(ax, (columns.paper - low) / (high - low), VERMILION, "x", "--")
     _axes(ax, columns, low, high, ax.get_window_extent().width / figure_of(ax).dpi / n)
     above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)} if n <= 2 else {"loc": "upper right"}
-    set_legend(ax, handles=_key(), fontsize=TEXT, handlelength=2.0, borderaxespad=0.2, **above)
+    key = (
+        Patch(color=BLUE, label="68 % of the draws"),
+        Patch(color=PALE_BLUE, label="95 % of the draws"),
+        Line2D([], [], color=BLACK, marker="+", ms=9, mew=1.4, label="point fit (MAP)"),
+        Line2D([], [], color=VERMILION, ls="--", marker="x", label="the paper's estimate, where in range"),
+    )
+    set_legend(ax, handles=key, fontsize=TEXT, handlelength=2.0, borderaxespad=0.2, **above)
 
 
 def _limits(columns: SampledParameters) -> tuple[np.ndarray, np.ndarray]:
@@ -539,15 +545,6 @@ def _ticks(low: float, high: float) -> list[tuple[float, str]]:
     exponent, step = next((e, step) for e, step in steps if math.floor(stop / step) > math.ceil(start / step))
     multiples = range(math.ceil(start / step), math.floor(stop / step) + 1)
     return [(k * step, fixed(k * step, max(-exponent, 0))) for k in multiples]
-
-
-def _key() -> tuple[Patch | Line2D, ...]:
-    return (
-        Patch(color=BLUE, label="68 % of the draws"),
-        Patch(color=PALE_BLUE, label="95 % of the draws"),
-        Line2D([], [], color=BLACK, marker="+", ms=9, mew=1.4, label="point fit (MAP)"),
-        Line2D([], [], color=VERMILION, ls="--", marker="x", label="the paper's estimate, where in range"),
-    )
 
 
 # traces: Traces of the sample: they show drift, and ensembles that disagree.
