@@ -17,7 +17,7 @@ from capsule_id.inference import least_squares as difference_descent
 from capsule_id.inference.curvature import BATCH, covariance, in_batches
 from capsule_id.inference.least_squares import LeastSquaresFit, Solver, least_squares, linearised
 from capsule_id.inference.marginal import density_of
-from capsule_id.inference.point_fit import AGREEMENT, dispersed_starts, variance_shares
+from capsule_id.inference.point_fit import AGREEMENT, described, dispersed_starts
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import HeldResiduals, LogPosterior
 from capsule_id.views import counted
@@ -176,26 +176,20 @@ def joint_fit(
         raise _not_finite(target, ends[best].fit, len(starts))
     fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
-    located_covariance = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0)
-    matrix[np.ix_(located, located)] = located_covariance.matrix
+    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0).matrix
     scatters = np.flatnonzero(target.scatter)
     matrix[scatters, scatters] = _scatter_variances(target, u[best])
-    spread = np.sqrt(np.diag(matrix))
-    theta = target.theta(u[best])
-    errors = np.full(target.dimension, np.nan)
-    errors[located] = located_covariance.standard_errors * np.where(target.positive, theta, 1.0)[located]
-    return PointFit(
-        names=target.names,
-        u=u[best],
-        values=dict(zip(target.names, (float(v) for v in theta), strict=True)),
+    return described(
+        target,
+        u[best],
+        fit.jacobian[0],
+        target.residual_owners(u[best]),
         covariance=matrix,
-        standard_errors=dict(zip(target.names, (float(e) for e in errors), strict=True)),
         starts=starts[: len(ends)],
         ends=u,
         log_posterior=value,
-        at_other_maximum=_at_another_maximum(u, value, spread),
+        at_other_maximum=_at_another_maximum(u, value, np.sqrt(np.diag(matrix))),
         stalled=np.array([not end.converged for end in ends]),
-        shares=variance_shares(target, fit.jacobian[0], target.residual_owners(u[best])),
     )
 
 

@@ -133,7 +133,7 @@ def geyer_size(draws: Draws) -> Float[np.ndarray, " d"]:
     return number / np.maximum(times, 1.0 / np.log10(number))
 
 
-# moves: Ensemble moves; a pilot run chooses among them by measured autocorrelation time.
+# moves: Ensemble moves.
 
 
 #: Share of the delayed moves whose inner chain is a random walk, its number of steps, and a step in sds of the posterior.
@@ -360,12 +360,3 @@ def delayed_moves(
         *(rescaling if scaled else []),
         (emcee.moves.DEMove(), other),
     ]
-
-
-def other_moves() -> dict[str, Moves]:
-    """Return the moves that need no proposal density."""
-    return {
-        # One snooker step in ten (ter Braak & Vrugt 2008).
-        "differential evolution + snooker": [(emcee.moves.DEMove(), 0.9), (emcee.moves.DESnookerMove(), 0.1)],
-        "stretch": [(emcee.moves.StretchMove(), 1.0)],
-    }

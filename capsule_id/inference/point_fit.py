@@ -4,6 +4,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -113,7 +114,6 @@ def point_fit(
         starts = np.concatenate([starts, further[None]])
     reported = len(starts)
     starts = np.concatenate([starts, target.nested_starts()])
-    located = target.located
     u, value, converged = _maxima(target, starts)
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
     kept = np.union1d(np.arange(reported), best)
@@ -122,19 +122,17 @@ def point_fit(
     at_fit = residual_jacobian(target, u[best])
     root = _root_of_covariance(target, u[best], at_fit)
     spread = np.sqrt(np.sum(root**2, axis=1))
-    theta, at_fit = target.theta(u[best]), at_fit[:, located]
-    return PointFit(
-        names=target.names,
-        u=u[best],
-        values=dict(zip(target.names, (float(v) for v in theta), strict=True)),
+    return described(
+        target,
+        u[best],
+        at_fit[:, target.located],
+        target.residual_owners(u[best], plain=True),
         covariance=root @ root.T,
-        standard_errors=_standard_errors(target, at_fit, theta),
         starts=starts,
         ends=u,
         log_posterior=value,
         at_other_maximum=~np.all(np.abs(u - u[best]) < AGREEMENT * spread, axis=1),
         stalled=~converged | ~np.isfinite(value),
-        shares=variance_shares(target, at_fit, _owners(target, theta)),
     )
 
 
@@ -239,21 +237,21 @@ def residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     return jacobian(target.plain_residuals, u, DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd))
 
 
-def _owners(target: LogPosterior, theta: np.ndarray) -> list[Experiment | None]:
-    """Experiment of every entry of ``plain_residuals`` at theta (d,); None: a prior."""
-    values = target.mapping(theta)
-    sizes = [np.size(e.residuals(e.local(values), np)) for e in target.experiments]
-    owners = [e for e, size in zip(target.experiments, sizes, strict=True) for _ in range(size)]
-    return [*owners, *[None] * target.dimension]
+def described(
+    target: LogPosterior, u: np.ndarray, at_fit: Jacobian, owners: Sequence[Experiment | None], **rest: Any
+) -> PointFit:
+    """The fit at u (d,), from the Jacobian ``at_fit`` (n, located) of the residuals and the ``owners`` of these.
 
-
-def _standard_errors(target: LogPosterior, at_fit: np.ndarray, theta: np.ndarray) -> dict[str, float]:
-    """Standard errors from the Jacobian ``at_fit`` (n, located) of the residuals; NaN for scatters; SI.
-
-    The error of a parameter sampled through its logarithm is its relative error times its value.
+    The error of a parameter sampled through its logarithm is its relative error times its value; NaN for scatters.
     """
-    located = ~target.scatter
-    errors = np.full(len(theta), np.nan)
+    theta, located, errors = target.theta(u), target.located, np.full(target.dimension, np.nan)
     matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
     errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
-    return dict(zip(target.names, (float(e) for e in errors), strict=True))
+    return PointFit(
+        names=target.names,
+        u=u,
+        values=dict(zip(target.names, theta.tolist(), strict=True)),
+        standard_errors=dict(zip(target.names, errors.tolist(), strict=True)),
+        shares=variance_shares(target, at_fit, owners),
+        **rest,
+    )

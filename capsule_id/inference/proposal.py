@@ -153,62 +153,66 @@ class Density(Protocol):
 
 
 class Mixture:
-    """Mixture of k Student densities of the coordinates w of d parameters.
+    """Student densities of several scales about one centre in the coordinates w of d parameters.
+
+    Some components draw parameters that may be absent from their priors, and the others given these.
 
     Parameters
     ----------
-    freedom : degrees of freedom
-    weights, centres, covariances : (k,), (k, d), (k, d, d); the covariances are squared scales
-    drawn : (k, d) parameters that a component draws from their priors; it draws the others given these
-    coordinates : of all components
+    centre, covariance : (d,) and (d, d) of w; the covariance is a squared scale
+    narrow : whether the tails are light
+    coordinates : by default u
+
+    Attributes
+    ----------
+    weights, drawn : (k,), (k, d) of the components, and the parameters that each draws from their priors
     """
 
     def __init__(
-        self,
-        freedom: float,
-        weights: Float[np.ndarray, " k"],
-        centres: Float[np.ndarray, "k d"],
-        covariances: Float[np.ndarray, "k d d"],
-        drawn: Bool[np.ndarray, "k d"] | None = None,
-        coordinates: Coordinates | None = None,
+        self, centre: Vector, covariance: Matrix, narrow: bool = False, coordinates: Coordinates | None = None
     ) -> None:
-        self.freedom, self.weights, self.centres, self.covariances = freedom, weights, centres, covariances
-        self.drawn = np.zeros(centres.shape, dtype=bool) if drawn is None else drawn
-        self.coordinates = coordinates or logarithmic(centres.shape[1])
-        pairs = [_given(covariance, own) for covariance, own in zip(covariances, self.drawn, strict=True)]
+        self._freedom, scales = NARROW if narrow else WIDE
+        self._centre, self._coordinates = centre, coordinates or logarithmic(len(centre))
+        weak = self._coordinates.weak
+        subsets = [subset for number in range(MOST_DRAWN + 1) for subset in combinations(weak, number)]
+        shares = np.full(len(subsets), FROM_PRIOR / max(len(subsets) - 1, 1))
+        shares[0] = 1.0 - np.sum(shares[1:])
+        self.weights = np.outer(shares, WEIGHTS).ravel()
+        self.drawn = np.repeat([np.isin(np.arange(len(centre)), own) for own in subsets], len(scales), axis=0)
+        squares = np.tile(np.array(scales)[:, None, None] ** 2 * covariance, (len(subsets), 1, 1))
+        pairs = [_given(square, own) for square, own in zip(squares, self.drawn, strict=True)]
         self._slopes, self._roots = (np.stack(each) for each in zip(*pairs, strict=True))
         self._inverses = np.linalg.inv(self._roots)
-        d = np.sum(~self.drawn, axis=1)
+        freedom, d = self._freedom, np.sum(~self.drawn, axis=1)
         size = np.sum(np.log(np.diagonal(self._roots, axis1=1, axis2=2)), axis=1)
         constant = gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom) - 0.5 * d * np.log(np.pi * freedom)
-        self._power, self._constant = 0.5 * (freedom + d), np.log(weights) + constant - size
+        self._power, self._constant = 0.5 * (freedom + d), np.log(self.weights) + constant - size
 
-    def components(self, u: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n"]]:
-        """Log-densities of u under the components, weights included; squared standardised distances from the centres."""
-        off = self.coordinates.w(u) - self.centres[:, None]
+    def components(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k n"]:
+        """Log-densities of u under the components, weights included."""
+        off = np.broadcast_to(self._coordinates.w(u) - self._centre, (len(self.weights), *u.shape))
         left = np.where(self.drawn[:, None], 0.0, off - off @ self._slopes.transpose(0, 2, 1))
         square = np.sum((left @ self._inverses.transpose(0, 2, 1)) ** 2, axis=2)
-        student = self._constant[:, None] - self._power[:, None] * np.log1p(square / self.freedom)
+        student = self._constant[:, None] - self._power[:, None] * np.log1p(square / self._freedom)
         # log |dw/du| is u for a parameter in theta.
-        jacobian = np.sum(np.where(self.coordinates.linear & ~self.drawn[:, None], u, 0.0), axis=2)
-        prior = np.sum(np.where(self.drawn[:, None], self.coordinates.prior_density(u), 0.0), axis=2)
-        return student + jacobian + prior, square
+        jacobian = np.sum(np.where(self._coordinates.linear & ~self.drawn[:, None], u, 0.0), axis=2)
+        prior = np.sum(np.where(self.drawn[:, None], self._coordinates.prior_density(u), 0.0), axis=2)
+        return student + jacobian + prior
 
     def log_density(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        return np.logaddexp.reduce(self.components(u)[0], axis=0)
+        return np.logaddexp.reduce(self.components(u), axis=0)
 
     def draw(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]:
         """Draw u; NaN where theta is not positive."""
         k = rng.choice(len(self.weights), size=size, p=self.weights)
-        scale = np.sqrt(self.freedom / rng.chisquare(self.freedom, size))
-        noise = scale[:, None] * rng.standard_normal((size, self.centres.shape[1]))
-        centre, drawn, coordinates = self.centres[k], self.drawn[k], self.coordinates
-        known = np.zeros_like(centre)
+        scale = np.sqrt(self._freedom / rng.chisquare(self._freedom, size))
+        noise = scale[:, None] * rng.standard_normal((size, len(self._centre)))
+        drawn, coordinates, known = self.drawn[k], self._coordinates, np.zeros_like(noise)
         if coordinates.weak:
-            known = np.where(drawn, coordinates.w(coordinates.draw_prior(rng, size)) - centre, 0.0)
+            known = np.where(drawn, coordinates.w(coordinates.draw_prior(rng, size)) - self._centre, 0.0)
         noise = np.where(drawn, 0.0, noise)
         left = (self._slopes[k] @ known[:, :, None] + self._roots[k] @ noise[:, :, None])[:, :, 0]
-        return coordinates.u(centre + known + left)
+        return coordinates.u(self._centre + known + left)
 
 
 def _given(covariance: Matrix, drawn: Bool[np.ndarray, " d"]) -> tuple[Matrix, Matrix]:
@@ -221,32 +225,6 @@ def _given(covariance: Matrix, drawn: Bool[np.ndarray, " d"]) -> tuple[Matrix, M
         slope[np.ix_(rest, drawn)], left = own, left - own @ across.T
     root[np.ix_(rest, rest)] = np.linalg.cholesky(left)
     return slope, root
-
-
-def concentric(
-    centre: Vector, covariance: Matrix, narrow: bool = False, coordinates: Coordinates | None = None
-) -> Mixture:
-    """Components of several scales about one ``centre``, and those that draw parameters from their priors.
-
-    Parameters
-    ----------
-    centre, covariance : (d,) and (d, d) of w
-    """
-    freedom, scales = NARROW if narrow else WIDE
-    weak = () if coordinates is None else coordinates.weak
-    subsets = [subset for number in range(MOST_DRAWN + 1) for subset in combinations(weak, number)]
-    drawn = np.array([np.isin(np.arange(len(centre)), subset) for subset in subsets])
-    shares = np.full(len(subsets), FROM_PRIOR / max(len(subsets) - 1, 1))
-    shares[0] = 1.0 - np.sum(shares[1:])
-    squares = np.array(scales)[:, None, None] ** 2 * covariance
-    return Mixture(
-        freedom,
-        np.outer(shares, WEIGHTS).ravel(),
-        np.tile(centre, (len(subsets) * len(scales), 1)),
-        np.tile(squares, (len(subsets), 1, 1)),
-        np.repeat(drawn, len(scales), axis=0),
-        coordinates,
-    )
 
 
 @dataclass(frozen=True)
@@ -277,7 +255,7 @@ class BlockProposal:
 def block_proposal(
     blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix, narrow: Sequence[bool] | None = None
 ) -> BlockProposal:
-    """Concentric mixtures in u for all blocks.
+    """Mixtures in u for all blocks.
 
     Parameters
     ----------
@@ -286,4 +264,4 @@ def block_proposal(
     """
     flags = narrow or [False] * len(blocks)
     pairs = zip(blocks, flags, strict=True)
-    return BlockProposal(blocks, [concentric(centre[b], covariance[np.ix_(b, b)], flag) for b, flag in pairs])
+    return BlockProposal(blocks, [Mixture(centre[b], covariance[np.ix_(b, b)], flag) for b, flag in pairs])

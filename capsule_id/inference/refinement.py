@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.special import ndtr
 
 from capsule_id.inference.curvature import Matrix
-from capsule_id.inference.proposal import BlockProposal, Density, Mixture, concentric, coordinates_of
+from capsule_id.inference.proposal import BlockProposal, Density, Mixture, coordinates_of
 
 # transport: Proposals of a bent posterior: a triangular map to coordinates that are nearly normal (Parno & Marzouk
 # 2018).
@@ -89,9 +89,7 @@ class Transported:
             self._means[own, i] = _least_squares(f, z[:, i], weights, ridge)
             self._scales[: 1 + i, i] = _log_scale(h, z[:, i] - f @ self._means[own, i], weights, ridge)
         x, _ = self._x(u)
-        self._mixture: Mixture = concentric(
-            np.average(x, axis=0, weights=weights), np.atleast_2d(np.cov(x.T, aweights=weights))
-        )
+        self._mixture = Mixture(np.average(x, axis=0, weights=weights), np.atleast_2d(np.cov(x.T, aweights=weights)))
 
     def _z(self, s: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         return np.linalg.solve(self._root, (s - self._mean).T).T
@@ -171,22 +169,18 @@ def _log_scale(
 # A short chain from the Laplace approximation misses tails where the width of the posterior depends on one
 # parameter, as on the correlation time of noise, or where two terms replace each other, as viscous and dry damping
 # do. Weighted draws from a wide proposal find them. Each round draws from the mixture of the round before. The
-# draws of all rounds are weighted by the mean of the densities of all rounds. They determine the next proposal: a
-# mixture, by expectation maximisation; in a large block a triangular map.
+# draws of all rounds are weighted by the mean of the densities of all rounds. They determine the next proposal: one
+# centre in the coordinates of the block; a triangular map in a large block, and where one centre does not suffice.
 
 
 #: Message where the sampler has no point to start from.
 NO_MASS = "no finite log-posterior near the point fit: the Laplace approximation does not hold there"
-#: Draws of a round, and rounds with one component and with several.
-DRAWS, SINGLE, SEVERAL = 2048, 4, 12
-#: Rounds with several components where an evaluation takes long.
+#: Draws of a round, rounds with one centre, and largest number of rounds, the later ones with maps.
+DRAWS, SINGLE, ROUNDS = 2048, 4, 16
+#: Rounds with maps where an evaluation takes long.
 FEWER = 2
-#: Number of components of a posterior that one component does not describe; components of less weight are dropped.
-COMPONENTS, LEAST_WEIGHT = 8, 0.01
-#: Steps of expectation maximisation after each round with several components.
-STEPS = 5
 #: Rounds end where the effective sample size of every block is this share of the draws of a round: after all rounds with
-#: one component, and before. Early rounds may miss a tail, and their effective sample size does not show it. A large
+#: one centre, and before. Early rounds may miss a tail, and their effective sample size does not show it. A large
 #: block keeps its first proposal above the first share where it is too large for a map, above the second otherwise: a
 #: scatter that may be zero has a tail that the Laplace approximation does not reach.
 ENOUGH, EXCELLENT = 0.3, 0.6
@@ -194,10 +188,6 @@ ENOUGH, EXCELLENT = 0.3, 0.6
 LEAST_SIZE, TEMPERS = 20.0, 0.8 ** np.arange(30)
 #: Fewest draws per parameter that determine a covariance.
 FEWEST = 2
-#: Covariances of components grow by this share of the variances of all draws, so that none collapses.
-FLOOR = 1e-3
-#: Share of the components about the mean of all draws where there are several others.
-DEFENSIVE = 0.2
 
 
 class _Rounds:
@@ -205,7 +195,6 @@ class _Rounds:
 
     def __init__(self, first: Density, prior: Float[np.ndarray, "2 d"], large: bool) -> None:
         self.proposals, self._prior, self._large = [first], prior, large
-        self._several: Mixture | None = None
         self._u = np.empty((0, prior.shape[1]))
         self._log_posterior = self._log_drawn = np.empty(0)
 
@@ -246,12 +235,12 @@ class _Rounds:
         u, weights = self._u[used], weights[used]
         if len(u) < FEWEST * u.shape[1]:
             return self.proposals[-1]
-        if self._large and u.shape[1] <= LARGEST_MAP:
+        if u.shape[1] <= LARGEST_MAP and (self._large or len(self.proposals) > SINGLE):
             return Transported(u, weights)
-        several = len(self.proposals) > SINGLE
-        mixture = _adapted(self._several, u, weights, self._prior, several, rng)
-        self._several = mixture if several else None
-        return mixture
+        coordinates = coordinates_of(u[rng.choice(len(u), len(u), p=weights)], self._prior)
+        w = coordinates.w(u)
+        covariance = np.atleast_2d(np.cov(w.T, aweights=weights))
+        return Mixture(np.average(w, axis=0, weights=weights), covariance, coordinates=coordinates)
 
 
 def refined(
@@ -269,8 +258,8 @@ def refined(
     parts : (n, d) -> (n, blocks), log-densities of the blocks
     prior : centre and width of the normal prior of u; NaN for a parameter with another prior
     large : for each block whether its first proposal stays where it is good enough; where it is not, a block of at most
-        ``LARGEST_MAP`` parameters gets a map, a larger one a mixture
-    rounds : largest number of rounds, by default ``SINGLE`` + ``SEVERAL``
+        ``LARGEST_MAP`` parameters gets a map at once, others after ``SINGLE`` rounds
+    rounds : largest number of rounds, by default ``ROUNDS``
 
     Raises
     ------
@@ -280,7 +269,7 @@ def refined(
     pairs = zip(first.blocks, first.densities, large, strict=True)
     blocks = [_Rounds(mixture, prior[:, block], own) for block, mixture, own in pairs]
     proposal = first
-    for i in range(rounds or SINGLE + SEVERAL):
+    for i in range(rounds or ROUNDS):
         u = proposal.draw(rng, DRAWS)
         inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in first.blocks], axis=1)
         u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
@@ -303,8 +292,8 @@ def refined(
 
 
 def affordable_rounds(evaluations: float) -> int:
-    """Largest number of rounds for about so many ``evaluations``, ``FEWER`` of them with several components at least."""
-    return int(np.clip(evaluations / DRAWS, SINGLE + FEWER, SINGLE + SEVERAL))
+    """Largest number of rounds for about so many ``evaluations``, ``FEWER`` of them with maps at least."""
+    return int(np.clip(evaluations / DRAWS, SINGLE + FEWER, ROUNDS))
 
 
 def effective_size(log_weights: Float[np.ndarray, " w"]) -> float:
@@ -326,81 +315,3 @@ def tempered(log_weights: Float[np.ndarray, " w"], least: float) -> Float[np.nda
         best = log_weights >= np.partition(log_weights, -number)[-number]
         weights = np.asarray(best & np.isfinite(log_weights), dtype=float)
     return weights / np.sum(weights)
-
-
-def _adapted(
-    before: Mixture | None,
-    u: Float[np.ndarray, "n d"],
-    weights: Float[np.ndarray, " n"],
-    prior: Float[np.ndarray, "2 d"],
-    several: bool,
-    rng: np.random.RandomState,
-) -> Mixture:
-    """Mixture of one block with one component or ``several``.
-
-    Parameters
-    ----------
-    before : mixture with several components of the round before; None: there is none
-    u, weights : draws and their normalised weights, above 0
-    prior : see ``refined``
-    """
-    coordinates = before.coordinates if before else coordinates_of(u[rng.choice(len(u), len(u), p=weights)], prior)
-    w = coordinates.w(u)
-    mean, covariance = np.average(w, axis=0, weights=weights), np.atleast_2d(np.cov(w.T, aweights=weights))
-    wide = concentric(mean, covariance, coordinates=coordinates)
-    if not several:
-        return wide
-    if before is None:
-        centres = w[rng.choice(len(w), COMPONENTS, p=weights)]
-        covariances = np.repeat(covariance[None], COMPONENTS, axis=0)
-        return _with_wide(np.full(COMPONENTS, 1.0 / COMPONENTS), centres, covariances, wide)
-    mixture = before
-    for _ in range(STEPS):
-        local = slice(0, len(mixture.weights) - len(wide.weights))
-        mixture = _with_wide(*maximised(mixture, u, weights, local, FLOOR * np.diag(np.diag(covariance))), wide)
-    return mixture
-
-
-def _with_wide(
-    weights: Float[np.ndarray, " k"],
-    centres: Float[np.ndarray, "k d"],
-    covariances: Float[np.ndarray, "k d d"],
-    wide: Mixture,
-) -> Mixture:
-    """Components in u or theta alone, then those of ``wide`` with the share ``DEFENSIVE`` and with their priors' share."""
-    alone = ~np.any(wide.drawn, axis=1)
-    own = np.where(alone, DEFENSIVE * wide.weights, wide.weights)
-    return Mixture(
-        wide.freedom,
-        np.concatenate([(1.0 - np.sum(own)) * weights, own]),
-        np.concatenate([centres, wide.centres]),
-        np.concatenate([covariances, wide.covariances]),
-        np.concatenate([np.zeros(centres.shape, dtype=bool), wide.drawn]),
-        wide.coordinates,
-    )
-
-
-def maximised(
-    mixture: Mixture,
-    u: Float[np.ndarray, "n d"],
-    weights: Float[np.ndarray, " n"],
-    local: slice,
-    floor: Float[np.ndarray, "d d"],
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k d"], Float[np.ndarray, "k d d"]]:
-    """Weights, centres and covariances of the ``local`` components after one step of expectation maximisation.
-
-    Parameters
-    ----------
-    u, weights : draws and their normalised weights
-    floor : added to the covariance of every component
-    """
-    terms, square = mixture.components(u)
-    shares = (weights * np.exp(terms - np.logaddexp.reduce(terms, axis=0)))[local]
-    total, w = np.sum(shares, axis=1), mixture.coordinates.w(u)
-    kept = total > LEAST_WEIGHT * np.sum(total)
-    shares, square, total = shares[kept], square[local][kept], total[kept]
-    near = shares * (mixture.freedom + w.shape[1]) / (mixture.freedom + square)
-    centres = near @ w / np.sum(near, axis=1)[:, None]
-    off = w - centres[:, None]
-    covariances = (near[:, :, None] * off).transpose(0, 2, 1) @ off / total[:, None, None] + floor
-    return total / np.sum(total), centres, covariances

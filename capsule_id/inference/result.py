@@ -76,7 +76,7 @@ class Posterior:
     ess_bulk, ess_tail : (d,) effective sample sizes for the stopping rule, see ``moves.bulk_and_tail_size``
     ess_wanted : the bulk and tail effective sample size that every parameter had to reach
     converged : every parameter has N > 20 tau, R-hat <= 1.01, and both sizes reach ``ess_wanted``
-    moves : pilot measurement: move -> largest tau, steps; the first move is used
+    moves : the move that was used -> its largest tau in the pilot, steps
     steps, thin : emcee steps after burn-in, and steps per stored draw
     """
 

@@ -3,11 +3,12 @@
 import hashlib
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import compress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
@@ -27,7 +28,6 @@ from capsule_id.inference.moves import (
     effective_sample_size,
     ensemble_time,
     integrated_time,
-    other_moves,
     pooled_time,
     split_rhat,
 )
@@ -417,7 +417,7 @@ DEFAULT_ESS = 1000.0
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks: so many, or this part of all.
 FIRST_CHECK, CHECK_EVERY, CHECK_SHARE = 40, 10, 5
-#: Work of all evaluations of the default budget, and of one measurement of the pilot, at most, in readings: some 20 s
+#: Work of all evaluations of the default budget, and of the rounds of an adaptation, at most, in readings: some 20 s
 #: and 5 s on two cores.
 MOST_WORK, PILOT_WORK = 1e9, 2.5e8
 #: Parameters of the smallest large block among those with a motion of the capsule: a forced run correlates all its
@@ -439,8 +439,8 @@ DEFAULT_BUDGET = 20_000
 #: Stored draws per autocorrelation time of the pilot, and the largest number of steps per stored draw. The limit is
 #: needed because a short pilot estimates the autocorrelation time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
-#: Steps of each measured move (short, long).
-PILOT_STEPS, LONG_PILOT_STEPS = 60, 300
+#: Steps of the pilot.
+PILOT_STEPS = 60
 #: Name of the first move, and of that of an emulated posterior with its number of steps.
 FIRST = "block independence + differential evolution"
 DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
@@ -448,22 +448,33 @@ DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
 CORRECTIONS, STATES = 3, 3
 #: The Laplace approximation is not adapted at autocorrelation times below this, in steps.
 PLAIN_TAU = 4.0
-#: The pilot of an adapted proposal stops, and an emulator is not corrected, at autocorrelation times below this, in steps.
+#: An emulator is not corrected at autocorrelation times below this, in steps.
 GOOD_TAU = 10.0
-#: Delayed acceptance is not measured again, and other kinds of moves are not tried, below this, in steps.
-FAIR_TAU = 100.0
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Density of the first walkers, move, thinning and burn-in of the recorded run, chosen by the pilot run."""
+    """Density of the first walkers, name of a move and the move, and walkers that it has moved for ``PILOT_STEPS``."""
 
     start: BlockProposal | Places
     move: str
     moves: Moves
-    measured: Mapping[str, float]
-    thin: int
-    burn_in: int
+    ensemble: Ensemble
+
+    @cached_property
+    def tau(self) -> float:
+        """Largest autocorrelation time of a parameter, in steps."""
+        return float(np.max(ensemble_time(self.ensemble.chain[None])))
+
+    @property
+    def thin(self) -> int:
+        """Steps per stored draw of the recorded run."""
+        return int(np.clip(self.tau / DRAWS_PER_TAU, 1, MAX_THIN))
+
+    @property
+    def burn_in(self) -> int:
+        """Steps of an ensemble before its first stored draw."""
+        return int(np.ceil(BURN_IN_IN_TAU * self.tau))
 
 
 class Target(Protocol):
@@ -558,7 +569,7 @@ def sample(
         ess_tail=tail,
         ess_wanted=ess,
         converged=_converged(draws, ess),
-        moves={schedule.move: schedule.measured[schedule.move], **schedule.measured},
+        moves={schedule.move: schedule.tau},
         steps=draws.shape[1] * schedule.thin,
         thin=schedule.thin,
     )
@@ -582,56 +593,30 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
 
 
 def pilot(target: Target, seed: int) -> Schedule:
-    """Find a proposal, then measure autocorrelation times of moves until one is short enough."""
-    random = np.random.RandomState(seed)
-    begin, name, first, ensemble = (_emulated if target.can_be_emulated else _proposed)(target, random)
-    moves, measured = {name: first, **other_moves()}, {name: _longest_time(ensemble)}
-    # The first move runs longer where that was not enough. The other moves come last, because they are slow.
-    for other in moves:
-        # A longer measurement of delayed acceptance, or of a slow move, takes longer than what it could save.
-        evaluations = LONG_PILOT_STEPS * len(ensemble.state.coords)
-        if (
-            min(measured.values()) < (GOOD_TAU if other == FIRST else FAIR_TAU)
-            or evaluations * target.work > PILOT_WORK
-        ):
-            break
-        ensemble = Ensemble(target.parts, ensemble.state, moves[other]).run(LONG_PILOT_STEPS)
-        measured[other] = _longest_time(ensemble)
-    best = min(measured, key=lambda name: measured[name])
-    tau = measured[best]
-    thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
-    return Schedule(begin, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
+    """Find a proposal, and measure the autocorrelation time of its moves."""
+    return (_emulated if target.can_be_emulated else _proposed)(target, np.random.RandomState(seed))
 
 
-class _Pilot(NamedTuple):
-    """Density of the first walkers, name of a move and the move, and walkers that it has moved for ``PILOT_STEPS``."""
-
-    start: BlockProposal | Places
-    name: str
-    moves: Moves
-    ensemble: Ensemble
-
-
-def _proposed(target: Target, random: np.random.RandomState) -> _Pilot:
+def _proposed(target: Target, random: np.random.RandomState) -> Schedule:
     """Moves by the Laplace approximation, or by a proposal adapted from it where they are slow or a term may be absent.
 
     A chain hardly shows whether it has missed the tail of such a term; rounds of weighted draws find it.
     """
     if np.max(np.diag(target.covariance)) < WEAK**2:
         plain = _moved(target, laplace_proposal(target)[0], random)
-        if _longest_time(plain.ensemble) < PLAIN_TAU and np.max(np.std(plain.ensemble.chain, axis=(0, 1))) < WEAK:
+        if plain.tau < PLAIN_TAU and np.max(np.std(plain.ensemble.chain, axis=(0, 1))) < WEAK:
             return plain
     return _moved(target, adapted_proposal(target, random), random)
 
 
-def _moved(target: Target, proposal: BlockProposal, random: np.random.RandomState) -> _Pilot:
+def _moved(target: Target, proposal: BlockProposal, random: np.random.RandomState) -> Schedule:
     """Moves by ``proposal``, and walkers that they have moved."""
     moves = block_move(proposal)
     walkers = Ensemble(target.parts, _initial(target, proposal, random), moves)
-    return _Pilot(proposal, FIRST, moves, walkers.run(PILOT_STEPS))
+    return Schedule(proposal, FIRST, moves, walkers.run(PILOT_STEPS))
 
 
-def _emulated(target: Target, random: np.random.RandomState) -> _Pilot:
+def _emulated(target: Target, random: np.random.RandomState) -> Schedule:
     """Moves of delayed acceptance by an emulated posterior.
 
     A long autocorrelation time may mean that walkers stay where the emulator is wrong: it learns the motions there. The
@@ -641,7 +626,7 @@ def _emulated(target: Target, random: np.random.RandomState) -> _Pilot:
     found = emulation(target, laplace, large, random)
     first = _delayed(target, found, _initial(target, found.start, random))
     for _ in range(CORRECTIONS):
-        if _longest_time(first.ensemble) < GOOD_TAU:
+        if first.tau < GOOD_TAU:
             break
         walkers = np.concatenate(first.ensemble.chain[:: -(PILOT_STEPS // STATES)])
         found = corrected(target, found, walkers, large, random)
@@ -649,15 +634,10 @@ def _emulated(target: Target, random: np.random.RandomState) -> _Pilot:
     return first
 
 
-def _delayed(target: Target, found: Emulation, state: State) -> _Pilot:
+def _delayed(target: Target, found: Emulation, state: State) -> Schedule:
     """Moves of delayed acceptance by the emulated posterior ``found``, and walkers that they move from ``state`` on."""
     moves = delayed_moves(found.target.parts, found.proposal, found.start.v, DELAYED_STEPS, target.scaled)
-    return _Pilot(found.start, DELAYED, moves, Ensemble(target.parts, state, moves).run(PILOT_STEPS))
-
-
-def _longest_time(ensemble: Ensemble) -> float:
-    """Largest autocorrelation time of a parameter, in steps."""
-    return float(np.max(ensemble_time(ensemble.chain[None])))
+    return Schedule(found.start, DELAYED, moves, Ensemble(target.parts, state, moves).run(PILOT_STEPS))
 
 
 def adapted_proposal(

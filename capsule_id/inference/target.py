@@ -442,13 +442,11 @@ class LogPosterior(eqx.Module):
         residuals = [*(jnp.ravel(part) for part, _ in parts), self.priors.residuals(u, values)]
         return jnp.concatenate(residuals), jnp.concatenate([*(j.reshape(-1, len(located)) for _, j in parts), slopes])
 
-    def residual_owners(self, u: np.ndarray) -> list[Experiment | None]:
-        """(n,) experiment of every entry of ``residuals`` at u (d,); None: a prior."""
-        values, owners = self.mapping(self.theta(u)), []
-        for group in self.groups:
-            first = self.experiments[group.members[0]]
-            size = len(first.residuals(first.local(values), np))
-            owners += [self.experiments[i] for i in group.members for _ in range(size)]
+    def residual_owners(self, u: np.ndarray, plain: bool = False) -> list[Experiment | None]:
+        """(n,) experiment of every entry of ``residuals``, or of ``plain_residuals``, at u (d,); None: a prior."""
+        values, order = self.mapping(self.theta(u)), [i for group in self.groups for i in group.members]
+        ordered = self.experiments if plain else [self.experiments[i] for i in order]
+        owners = [e for e in ordered for _ in range(np.size(e.residuals(e.local(values), np)))]
         return [*owners, *[None] * self.dimension]
 
     def prior_residuals(self, u: np.ndarray) -> np.ndarray:

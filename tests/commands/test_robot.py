@@ -20,7 +20,6 @@ def test_a_robot_is_fitted_sampled_and_predicted(tmp_path: Path, monkeypatch: py
     # The default pilot takes minutes on a loaded machine; its moves are not what is tested.
     for module, name, value in (
         (ensembles, "PILOT_STEPS", 40),
-        (ensembles, "LONG_PILOT_STEPS", 40),
         (refinement, "DRAWS", 256),
     ):
         monkeypatch.setattr(module, name, value)
