@@ -114,11 +114,15 @@ class Excitation(Drive):
         """|P_d|, N."""
         return abs(self.P_d)
 
+    def cosine(self, t: Any) -> Any:
+        """cos(Omega t + phase) at the times t, s."""
+        angle = self.Omega * t + self.phase
+        return array_module(angle).cos(angle)
+
     def force_at(self, t: Any, piece: Any = None) -> Any:
         """P_d cos(Omega t + phase), N."""
         del piece
-        angle = self.Omega * t + self.phase
-        return self.P_d * array_module(angle).cos(angle)
+        return self.P_d * self.cosine(t)
 
     def frequency(self) -> Any:
         """|Omega|."""
