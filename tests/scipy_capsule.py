@@ -46,9 +46,8 @@ def simulate_scipy(
 ) -> tuple[np.ndarray, int]:
     """(states (n, 4) at ``times`` from ``start`` (4,), default at rest; closings of the gap).
 
-    q holds the parameters, P_d, Omega, possibly a phase, and departures from the paper's model: k1_cubic, N/m^3,
-    power, of the penetration in the contact, and backward, the friction of backward over that of forward motion.
-    law: another law of friction than eq. (1).
+    q holds the parameters, P_d, Omega, possibly a phase, and departures from the paper's model: k1_cubic, N/m^3, power,
+    of the penetration, and backward, friction backward over that forward. law: another law of friction than eq. (1).
     """
     law, phase = law or eq_1(q), q.get("phase", 0.0)
     holds_forward, holds_backward = law[0](0.0), law[1](0.0)

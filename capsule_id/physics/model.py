@@ -37,7 +37,6 @@ from capsule_id.physics.batches import NumberOrBatch, is_traced, lanes_of, run_l
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drive import Excitation as Excitation
 from capsule_id.physics.drives import RodMotion
-from capsule_id.physics.forces import Force
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law
 from capsule_id.precision import require_float64
 
@@ -69,7 +68,7 @@ class CapsuleParameters:
     slope : of the ground, rad, +X uphill         N0 : force that presses the capsule down, N, besides the weight
     mu_back : static friction coefficient of backward sliding, 1; None: as mu
     ratio : kinetic over static friction, 1       viscous : viscous friction of the ground, N s/m
-    forces : further forces between rod and capsule, each of a class of its own
+    forces : further forces between rod and capsule, a tuple of ``Force``
 
     k2 = 0 or G = inf: no support spring, and no c2; likewise the back spring.
     """
@@ -92,7 +91,7 @@ class CapsuleParameters:
     mu_back: NumberOrBatch | None = None
     ratio: NumberOrBatch = 0.5
     viscous: NumberOrBatch = 0.0
-    forces: tuple[Force, ...] | None = None
+    forces: Any = None
 
 
 AnyDrive = TypeVar("AnyDrive", bound=Drive)
