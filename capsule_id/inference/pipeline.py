@@ -177,7 +177,7 @@ def make_result(
     rng = np.random.default_rng(seed)
     predictive = {e.label: e.predictive_p([e.local(d) for d in checked.draws], rng) for e in target.experiments}
     summary, nuisances = parameter_tables(checked, registry)
-    pointwise, findings = None, checked.findings
+    pointwise, findings = None, tuple(checked.findings)
     if posterior is not None:
         pointwise = _pointwise(target, posterior, rng)
         findings = (*findings, decisive_readings(pointwise, posterior.draws))
