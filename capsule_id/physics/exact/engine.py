@@ -233,7 +233,7 @@ def initial_lanes(
 
     gaps = tuple(map(without_rounding, constants.contacts))
     state = CapsuleState(t, X1 - X2, Y1 - Y2, X2, Y2, constants.drive.piece(t), gaps)
-    given = jnp.stack([*jax.tree.leaves(state), t_end])
+    given = jnp.stack([*jax.tree.leaves(state._replace(drive=state.drive[:-1])), t_end])
     valid = jnp.all(jnp.isfinite(given), axis=0) & admissible(p, constants.drive, constants.law)
     valid = valid & constants.drive.covers(t, t_end)
     zero = jnp.zeros(t.shape, jnp.int32)
