@@ -28,8 +28,7 @@ from capsule_id.parameters import Prior, scatter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.friction import FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.schema import ColumnRule
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import ColumnRule, Entry
 from capsule_id.rig.toml import POSITIVE
 from capsule_id.views import Finding, Message
 

@@ -22,8 +22,7 @@ from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.schema import ColumnRule, GroundSettings
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings
 from capsule_id.rig.toml import POSITIVE
 from capsule_id.views import Comparison, Curve, Finding, Message, Points, counted
 

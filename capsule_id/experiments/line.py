@@ -21,7 +21,7 @@ from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
 from capsule_id.experiments.point_test import PointTest
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import Entry
 from capsule_id.views import Comparison, Curve, Finding, Message, ResultTable
 
 # line: Shared declarations of calibration lines: rule on reading errors, the paper's straight line, lint.

@@ -21,8 +21,7 @@ from capsule_id.experiments.friction_variants import CHECKS, TABLES
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.model import Table
-from capsule_id.rig.schema import ColumnRule
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import ColumnRule, Entry
 from capsule_id.rig.toml import POSITIVE
 
 # declaration: Steady sliding: columns and template.

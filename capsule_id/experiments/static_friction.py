@@ -28,8 +28,7 @@ from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.physics.batches import array_module
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.schema import ColumnRule, QuantityRule
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import ColumnRule, Entry, QuantityRule
 from capsule_id.rig.toml import POSITIVE, SLOPE_ANGLE
 
 # declaration: Tilts or pulls until the capsule slips: columns, settings, rules, template and twin.

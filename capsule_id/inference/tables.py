@@ -11,9 +11,8 @@ import pandas as pd
 from capsule_id.experiments import paper_estimates
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.checks.posterior import runs_alone
-from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.checks.settings import SampledFit, Widening
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
-from capsule_id.inference.checks.widening import Widening
 from capsule_id.inference.curvature import covariance
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.point_fit import residual_jacobian

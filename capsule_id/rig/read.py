@@ -20,6 +20,7 @@ from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
     TABLE_KEYS,
+    Entry,
     KindRule,
     check_engine,
     check_masses,
@@ -29,7 +30,7 @@ from capsule_id.rig.schema import (
     read_model,
     read_rules,
 )
-from capsule_id.rig.tables import Entry, read_experiment_files
+from capsule_id.rig.tables import read_experiment_files
 from capsule_id.rig.toml import NAME_PATTERN, Node, closest, parse_toml, shown
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none

@@ -6,9 +6,9 @@ from functools import cache
 from math import cos
 from types import MappingProxyType, UnionType
 from typing import (
-    TYPE_CHECKING,
     Annotated,
     Any,
+    Generic,
     Literal,
     Protocol,
     Union,
@@ -18,13 +18,12 @@ from typing import (
     runtime_checkable,
 )
 
+from capsule_id.errors import InputError
 from capsule_id.parameters import TABLE, Parameter
-from capsule_id.rig.model import ModelChoices, Quantity, Settings, Table
+from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.model import ModelChoices, Quantity, S, Settings, Table
 from capsule_id.rig.toml import ANY, INCLINE, POSITIVE, Domain, Node, closest, is_count, shown
-
-if TYPE_CHECKING:
-    from capsule_id.rig.tables import Entry
-
+from capsule_id.views import counted
 
 # schema: Types for the columns, settings and rules of a kind of experiment. The reader uses no other type of a kind.
 
@@ -152,6 +151,80 @@ class NameRule:
 COUNT = PlainRule(is_count, "be a whole number, 1 or more", "write e.g. 10")
 
 
+@dataclass(frozen=True)
+class Entry(Generic[S]):
+    """The argument of a kind's rules.
+
+    Attributes
+    ----------
+    table : columns and settings, SI
+    node : the entry in ``rig.toml``
+    file : the table as written
+    """
+
+    table: Table[S]
+    node: Node
+    file: RawTable
+
+    def error(self, key: str, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
+        """The error about a setting, at its value or key; ``key`` "" means the whole entry."""
+        return (self.node.get(key, None) if key else self.node).error(rule, value, remedy, of_key)
+
+    def refuse_ground(self, key: str, rule: str) -> None:
+        """Refuse a slope or N0 that this experiment cannot have, its own or that of [rig].
+
+        Raises
+        ------
+        InputError
+            Where ``key``, "slope" or "N0", is stated.
+        """
+        settings: Any = self.table.settings
+        if stated := settings.ground.get(key):
+            unit = "deg" if key == "slope" else "N"
+            raise node_of_ground(self.node, key).error(
+                rule,
+                f"{stated.value:.3g}{f' ± {stated.sd:.3g}' if stated.sd else ''} in SI units",
+                f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it',
+            )
+
+    def check_spring_with_gap(self) -> None:
+        """Require a gap where a spring is within reach.
+
+        Raises
+        ------
+        InputError
+            At the one of spring and gap that stands alone.
+        """
+        settings: Any = self.table.settings
+        if (settings.spring is None) != (settings.gap is None):
+            one, other = ("spring", "gap") if settings.gap is None else ("gap", "spring")
+            raise self.error(
+                one,
+                "spring and gap must stand together",
+                f"{one} alone",
+                f"add {other}, or remove {one} where the support spring is out of reach",
+                of_key=True,
+            )
+
+    def check_length(self) -> None:
+        """Refuse a record that is too short to fit.
+
+        Raises
+        ------
+        InputError
+            At the last sample.
+        """
+        samples = len(self.table.rows)
+        if samples < SHORTEST_RECORD:
+            raise self.file.error(
+                samples - 1,
+                "time",
+                f"a record must have at least {SHORTEST_RECORD} samples",
+                counted(samples, "sample"),
+                f"record {self.table.kind} for longer or faster",
+            )
+
+
 @dataclass(frozen=True, kw_only=True)
 class KindRule:
     """The properties of one kind of experiment that the reader uses.
@@ -179,7 +252,7 @@ class KindRule:
     channels: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
     settings: type[Settings] = Settings
-    rules: tuple[Callable[["Entry[Any]"], None], ...] = ()
+    rules: tuple[Callable[[Entry[Any]], None], ...] = ()
     masses: Callable[[Table[Any]], tuple[str, ...]] = field(default=lambda table: ())
     masses_of_free: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     meant: tuple[str, ...] = ()

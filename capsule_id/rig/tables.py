@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
-from typing import Any, Generic
 
 import numpy as np
 
@@ -18,9 +17,9 @@ from capsule_id.rig.formats.raw import Layout, Place, RawTable, TextFile
 from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError
 from capsule_id.rig.guess import find_layout, proposal
 from capsule_id.rig.maps import apply_map, on_reference, read_clock, read_map
-from capsule_id.rig.model import NO_DRIFT, Column, Quantity, S, Table
+from capsule_id.rig.model import NO_DRIFT, Column, Quantity
 from capsule_id.rig.plateaus import outlying_rows, read_plateaus, read_rejection, readings_of_plateaus
-from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, KindRule, node_of_ground
+from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml import LARGEST, SMALLEST, Node, closest, is_plausible, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 from capsule_id.views import counted
@@ -370,77 +369,3 @@ def _check_values(raw: RawTable, index: int, rule: ColumnRule, values: np.ndarra
 
 
 # entry: One ``[[experiment]]`` during its check: its table, and the places for error lines.
-
-
-@dataclass(frozen=True)
-class Entry(Generic[S]):
-    """The argument of a kind's rules.
-
-    Attributes
-    ----------
-    table : columns and settings, SI
-    node : the entry in ``rig.toml``
-    file : the table as written
-    """
-
-    table: Table[S]
-    node: Node
-    file: RawTable
-
-    def error(self, key: str, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
-        """The error about a setting, at its value or key; ``key`` "" means the whole entry."""
-        return (self.node.get(key, None) if key else self.node).error(rule, value, remedy, of_key)
-
-    def refuse_ground(self, key: str, rule: str) -> None:
-        """Refuse a slope or N0 that this experiment cannot have, its own or that of [rig].
-
-        Raises
-        ------
-        InputError
-            Where ``key``, "slope" or "N0", is stated.
-        """
-        settings: Any = self.table.settings
-        if stated := settings.ground.get(key):
-            unit = "deg" if key == "slope" else "N"
-            raise node_of_ground(self.node, key).error(
-                rule,
-                f"{stated.value:.3g}{f' ± {stated.sd:.3g}' if stated.sd else ''} in SI units",
-                f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it',
-            )
-
-    def check_spring_with_gap(self) -> None:
-        """Require a gap where a spring is within reach.
-
-        Raises
-        ------
-        InputError
-            At the one of spring and gap that stands alone.
-        """
-        settings: Any = self.table.settings
-        if (settings.spring is None) != (settings.gap is None):
-            one, other = ("spring", "gap") if settings.gap is None else ("gap", "spring")
-            raise self.error(
-                one,
-                "spring and gap must stand together",
-                f"{one} alone",
-                f"add {other}, or remove {one} where the support spring is out of reach",
-                of_key=True,
-            )
-
-    def check_length(self) -> None:
-        """Refuse a record that is too short to fit.
-
-        Raises
-        ------
-        InputError
-            At the last sample.
-        """
-        samples = len(self.table.rows)
-        if samples < SHORTEST_RECORD:
-            raise self.file.error(
-                samples - 1,
-                "time",
-                f"a record must have at least {SHORTEST_RECORD} samples",
-                counted(samples, "sample"),
-                f"record {self.table.kind} for longer or faster",
-            )

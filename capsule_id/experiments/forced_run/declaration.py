@@ -17,8 +17,7 @@ from capsule_id.records.tones import recorded_drive, stated_Omega
 from capsule_id.records.view import describe_run
 from capsule_id.rig.filters import median_step, sampling_step
 from capsule_id.rig.model import Column, Quantity, Rig, Table
-from capsule_id.rig.schema import ColumnRule, GroundSettings, NameRule, QuantityRule
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings, NameRule, QuantityRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE
 from capsule_id.views import Facts, Finding, Message, stated_p
 

@@ -31,8 +31,7 @@ from capsule_id.parameters import Parameter, Prior, nuisance, scatter
 from capsule_id.records.release import shortened
 from capsule_id.rig.filters import median_step
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, Entry
 from capsule_id.views import counted
 
 # twin: Synthetic free decays.

@@ -39,8 +39,7 @@ from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.records.tones import frequency_of, length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.schema import SHORTEST_RECORD
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import SHORTEST_RECORD, Entry
 from capsule_id.views import Facts, Finding, Message, counted, filled_in
 
 # lint: Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any

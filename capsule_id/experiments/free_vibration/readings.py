@@ -13,8 +13,7 @@ from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.records.tones import frequency_of
 from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
-from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, QuantityRule, WordsRule
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import COUNT, Entry, GroundSettings, NameRule, QuantityRule, WordsRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE
 from capsule_id.views import Facts, Finding, Message
 

@@ -12,8 +12,7 @@ from capsule_id.experiments.forced_run.declaration import DriveRule, check_drive
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.rig.model import Column, Quantity, Rig, Table
-from capsule_id.rig.schema import ColumnRule, GroundSettings, QuantityRule
-from capsule_id.rig.tables import Entry
+from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings, QuantityRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
 from capsule_id.views import Finding, Message
 

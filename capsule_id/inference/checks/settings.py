@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import optimize, stats
@@ -20,10 +19,6 @@ from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import is_stated
 from capsule_id.rig.model import Rig
 from capsule_id.views import Facts, Finding
-
-if TYPE_CHECKING:
-    from capsule_id.inference.checks.widening import Widening
-
 
 # tension: Likelihood-ratio test of a parameter that two groups of experiments share (friction: tilts and slides).
 
@@ -64,6 +59,36 @@ def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
 # sampled fit: Data of a finished fit that checks and tables read.
 
 
+#: Largest factor of an sd beside which the fit still gives a number.
+LARGEST_FACTOR = 30.0
+
+
+@dataclass(frozen=True)
+class Widening:
+    """Error of the model of one parameter.
+
+    Attributes
+    ----------
+    factor : of its sd, at least 1
+    quantile : Student's t quantile over the normal one, for the ends of the 95 % interval
+    parts : number of parts of the data
+    """
+
+    factor: float
+    quantile: float
+    parts: int
+
+    @property
+    def stretch(self) -> float:
+        """Factor of the half-length of the 95 % interval."""
+        return self.factor * self.quantile
+
+    @property
+    def no_number(self) -> bool:
+        """Whether the parts contradict each other so far that the fit gives no number."""
+        return not self.factor <= LARGEST_FACTOR
+
+
 @dataclass(frozen=True)
 class SampledFit:
     """A point fit, its sample (None where nothing was sampled) and its findings so far.
@@ -86,7 +111,7 @@ class SampledFit:
     flagged: Mapping[str, Sequence[int]] = field(default_factory=dict)
     findings: Sequence[Finding] = ()
     bench: BenchFit = field(default_factory=BenchFit)
-    widened: Mapping[str, "Widening"] = field(default_factory=dict)
+    widened: Mapping[str, Widening] = field(default_factory=dict)
 
     @property
     def rig(self) -> Rig:

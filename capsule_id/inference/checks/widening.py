@@ -1,7 +1,7 @@
 """Error of the model, from the scatter of a parameter between parts of the data or of a record."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +11,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks import estimate
 from capsule_id.experiments.friction_model import EQUATION_1
-from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.checks.settings import SampledFit, Widening
 from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.parameters import is_stated
 from capsule_id.records.tones import length_of_motion
@@ -30,34 +30,8 @@ FEWEST_PARTS, MOST_PARTS = 4, 8
 ROWS_PER_UNKNOWN = 2
 #: Largest sd of a part that determines a parameter, relative to its value.
 LARGEST_RELATIVE_SD = 0.5
-#: Smallest factor of an sd that counts, and largest one beside which the fit still gives a number.
-SMALLEST_FACTOR, LARGEST_FACTOR = 1.01, 30.0
-
-
-@dataclass(frozen=True)
-class Widening:
-    """Error of the model of one parameter.
-
-    Attributes
-    ----------
-    factor : of its sd, at least 1
-    quantile : Student's t quantile over the normal one, for the ends of the 95 % interval
-    parts : number of parts of the data
-    """
-
-    factor: float
-    quantile: float
-    parts: int
-
-    @property
-    def stretch(self) -> float:
-        """Factor of the half-length of the 95 % interval."""
-        return self.factor * self.quantile
-
-    @property
-    def no_number(self) -> bool:
-        """Whether the parts contradict each other so far that the fit gives no number."""
-        return not self.factor <= LARGEST_FACTOR
+#: Smallest factor of an sd that counts.
+SMALLEST_FACTOR = 1.01
 
 
 def widenings(s: SampledFit) -> dict[str, Widening]:
