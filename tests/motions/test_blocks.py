@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from capsule_id.commands.bifurcate import cluster
+from capsule_id.commands.bifurcate import client_of
 from capsule_id.errors import InputError
 from capsule_id.motions import sweep as blocks
 from capsule_id.motions.response import Settling
@@ -84,21 +84,21 @@ def test_a_store_serves_its_own_points_only(tmp_path: Path) -> None:
 
 
 def test_a_cluster_of_threads_gives_the_same_map(whole: xr.Dataset, tmp_path: Path) -> None:
-    with cluster("threads") as client:
+    with client_of("threads") as client:
         data = motion_map(P, E, OVER, settling=QUICK, block=20, client=client, store=tmp_path / "store")
     xr.testing.assert_identical(data, whole)
     assert len(list((tmp_path / "store").glob("block_*.npz"))) == 5
 
 
 def test_an_address_where_nobody_answers() -> None:
-    with pytest.raises(InputError, match="the address of a Dask scheduler"), cluster("nowhere:1:2"):
+    with pytest.raises(InputError, match="the address of a Dask scheduler"), client_of("nowhere:1:2"):
         pass
 
 
 def killed_on_the_way(over: dict[str, np.ndarray], settling: Settling, block: int) -> xr.Dataset:
     """The map through a cluster of processes of which one is killed when a quarter is done."""
     killed: list[int] = []
-    with cluster("processes") as client:
+    with client_of("processes") as client:
         pids = list(client.run(os.getpid).values())
         assert len(pids) >= 2, "with one worker there is nobody to take over"
 
