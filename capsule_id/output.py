@@ -35,7 +35,8 @@ def check_directory(directory: Path) -> None:
     Raises
     ------
     InputError
-        If it is something else; this is never overwritten.
+        If it is something else, which is never overwritten, or where something else stands in the place of its
+        unfinished work or of its older result.
     """
     rule, remedy = "the output directory must be new or a result of fit-params", "choose another --out"
     if directory.name in ("", "..") or directory.name.endswith((PARTIAL, OLD, LOCK)):

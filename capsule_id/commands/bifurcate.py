@@ -137,11 +137,10 @@ def client_of(scheduler: str | None) -> "Iterator[Client | None]":
         # A client that no scheduler answers does not restore the setting of Dask, and nothing could be computed later.
         opened.enter_context(config.set(scheduler=config.get("scheduler", None)))
         if processes or scheduler == "threads":
-            address: Any = opened.enter_context(LocalCluster(**local))
-        else:
-            address = scheduler
+            yield opened.enter_context(Client(opened.enter_context(LocalCluster(**local))))
+            return
         try:
-            client = Client(address, timeout=CONNECT_TIMEOUT)
+            client = Client(scheduler, timeout=CONNECT_TIMEOUT)
         except (OSError, ValueError) as error:
             rule = "--scheduler is threads, processes or the address of a Dask scheduler"
             value = f"{scheduler}: {type(error).__name__}"
@@ -383,13 +382,13 @@ def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
             "remove --method",
         ),
         (
-            args.scheduler and not blocks,
+            args.scheduler is not None and not blocks,
             "--scheduler is for maps and bands",
             alone,
             "remove it, or add --with or --posterior",
         ),
         (args.resume and not blocks, "--resume is for maps and bands", alone, "remove --resume"),
-        (args.draws and not bands, "--draws needs --posterior", "there is none", "add --posterior FILE"),
+        (args.draws is not None and not bands, "--draws needs --posterior", "there is none", "add --posterior FILE"),
     ):
         if wrong:
             raise InputError(rule, value, remedy)

@@ -99,7 +99,7 @@ def _plain(value: object) -> object:
             return {str(key): _plain(item) for key, item in value.items()}
         case np.ndarray() | np.generic():
             return _plain(value.tolist())
-        case list() | tuple():
+        case Sequence() if not isinstance(value, str | bytes):
             return [_plain(item) for item in value]
         case float():
             return value if math.isfinite(value) else None

@@ -345,7 +345,8 @@ class _Part:
                     f"a difference of {np.nanmax(np.abs(same - values)):.3g}",
                     "name files that were recorded together",
                 )
-        return values, lambda row: first.place(row, column)
+        place = first.place  # the numbers of the file are not kept beside the table
+        return values, lambda row: place(row, column)
 
     def words(self, node: Node, header: Header) -> np.ndarray:
         """The texts of the column ``header``, stated at ``node`` of ``rig.toml``, (n,)."""

@@ -366,6 +366,3 @@ def _check_values(raw: RawTable, index: int, rule: ColumnRule, values: np.ndarra
                 in_files = "name the files in the order of time, or make an experiment of each"
                 remedy = remedy_of_order(raw, index) if same else in_files
             raise raw.error(row, name, f"{name} must {text}", f"{raw.columns[index][row]:g} {unit}", remedy)
-
-
-# entry: One ``[[experiment]]`` during its check: its table, and the places for error lines.

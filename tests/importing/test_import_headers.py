@@ -43,6 +43,16 @@ def test_a_record_of_an_angle_is_no_table_of_tilts(tmp_path: Path, header: str, 
     assert np.allclose(table[name], factor * x, rtol=1e-4, atol=1e-5)
 
 
+def test_empty_brackets_leave_the_unit_to_the_row_of_units(tmp_path: Path) -> None:
+    """Before: a unit that the file does not state, although its second line does."""
+    time = np.arange(0.0, 5.0, 0.01)
+    rows = "".join(f"{t:.2f};{3.0 * np.exp(-0.3 * t) * np.cos(25.0 * t):.5f}\n" for t in time)
+    (tmp_path / "a.csv").write_text("Zeit [];Weg []\ns;mm\n" + rows, encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "a.csv")
+    assert 'time = { from = "Zeit []", unit = "s" }' in entry
+    assert 'x_rel = { from = "Weg []", unit = "mm" }' in entry
+
+
 def test_a_record_in_time_is_never_surely_a_table_of_trials(tmp_path: Path) -> None:
     """A pull recorded in time is no list of pulls; the same column without times may be one."""
     force = 3.0 + np.sin(np.arange(100.0))

@@ -28,7 +28,7 @@ from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTa
 # feasibility: Feasibility of a forced run: contact, motion of the capsule, sampling rate and length of the record.
 #
 # The test uses settings, not readings, of a run that starts from rest. It runs before a fit with rough values of
-# the same folder (``rough_values.py``), and after a fit with fitted values.
+# the same folder (``experiments.rough_values``), and after a fit with fitted values.
 
 
 #: Smallest number of samples per contact with the support spring that resolves an impact.

@@ -1,4 +1,4 @@
-"""Readers of text tables: blocks of lines, cells, rows of numbers, CSV."""
+"""Readers of text tables: cells, rows of numbers, CSV."""
 
 import csv
 import io
