@@ -335,7 +335,7 @@ def _cut(table: Table[Any], used: slice, key: str, time: float) -> str:
     return f"Add this line to the experiment in rig.toml: {line}" if decay else "Record again."
 
 
-def _fault(table: Table[Any], code: str, rows: np.ndarray, level: Level, **facts: object) -> Finding:
+def _fault(table: Table[Any], code: str, rows: np.ndarray, level: Level, /, **facts: object) -> Finding:
     """A finding on ``rows`` of a record: file, line and time of the first one, and further facts."""
     first = int(rows[0])
     place = {"file": table.file, "line": int(table.rows[first]), "time": float(table["time"][first])}

@@ -100,6 +100,10 @@ class PointTest(GroundExperiment):
         return no_design(n, xp)
 
     @property
+    def masses(self) -> tuple[str, ...]:  # type: ignore[override]  # pyright: ignore
+        return self.friction.masses if FRICTION in self.reads else ()
+
+    @property
     def observed(self) -> np.ndarray:
         return self.readings[self.reading]
 

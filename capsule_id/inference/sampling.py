@@ -31,7 +31,7 @@ from capsule_id.inference.moves import (
     pooled_time,
     split_rhat,
 )
-from capsule_id.inference.proposal import WEAK, BlockProposal, block_proposal
+from capsule_id.inference.proposal import BlockProposal, block_proposal
 from capsule_id.inference.refinement import (
     LARGEST_MAP,
     NO_MASS,
@@ -446,8 +446,6 @@ FIRST = "block independence + differential evolution"
 DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
 #: Largest number of corrections of an emulator, and states of the pilot that each of them learns from.
 CORRECTIONS, STATES = 3, 3
-#: The Laplace approximation is not adapted at autocorrelation times below this, in steps.
-PLAIN_TAU = 4.0
 #: An emulator is not corrected at autocorrelation times below this, in steps.
 GOOD_TAU = 10.0
 
@@ -598,19 +596,11 @@ def pilot(target: Target, seed: int) -> Schedule:
 
 
 def _proposed(target: Target, random: np.random.RandomState) -> Schedule:
-    """Moves by the Laplace approximation, or by a proposal adapted from it where they are slow or a term may be absent.
+    """Moves by an adapted proposal.
 
-    A chain hardly shows whether it has missed the tail of such a term; rounds of weighted draws find it.
+    A short chain of the Laplace approximation does not show what it has missed; rounds of weighted draws find it.
     """
-    if np.max(np.diag(target.covariance)) < WEAK**2:
-        plain = _moved(target, laplace_proposal(target)[0], random)
-        if plain.tau < PLAIN_TAU and np.max(np.std(plain.ensemble.chain, axis=(0, 1))) < WEAK:
-            return plain
-    return _moved(target, adapted_proposal(target, random), random)
-
-
-def _moved(target: Target, proposal: BlockProposal, random: np.random.RandomState) -> Schedule:
-    """Moves by ``proposal``, and walkers that they have moved."""
+    proposal = adapted_proposal(target, random)
     moves = block_move(proposal)
     walkers = Ensemble(target.parts, _initial(target, proposal, random), moves)
     return Schedule(proposal, FIRST, moves, walkers.run(PILOT_STEPS))

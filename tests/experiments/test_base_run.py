@@ -95,6 +95,17 @@ def test_a_shaken_capsule_is_identified(tmp_path: Path) -> None:
         assert sds[name] < 0.05 * truth
 
 
+def test_the_portrait_of_a_shaken_run_needs_no_mass_of_the_rod(tmp_path: Path) -> None:
+    """With a spring in reach, and a normal force that makes the mass of the rod unknown."""
+    own = entry(spring='"L60"', gap=quantity(20.0, "mm"))
+    columns = {**own.columns, "x_rel [m]": own.columns["x_base [m]"] - own.columns["x_capsule [m]"]}
+    shaken = make_rig(tmp_path, replace(own, columns=columns), head={"m2": quantity(M2, "kg")})
+    run = BaseRun(shaken.tables[0], shaken)
+    values = {row.symbol: 0.0 for row in run.parameters} | TRUTH | {"k2": 2e3, "m2": M2, "g": 9.81}
+    values |= {row.symbol: NOISE for row in run.parameters if row.symbol.startswith("noise")}
+    assert any("phase_portrait" in panel.label for panel in run.comparisons(values, []))
+
+
 def test_the_stated_normal_force_replaces_the_weight(tmp_path: Path) -> None:
     values = {**TRUTH, "m2": M2, "g": 9.81, "x_start": 0.0, "noise_x_capsule": NOISE}
     tables = [

@@ -50,6 +50,11 @@ def test_planted_faults_are_named(tmp_path: Path, fault: Fault) -> None:
     assert share_named(tmp_path, fault, 6) == 1.0
 
 
+@pytest.mark.parametrize("fault", [duplicate, clip, rest, wrong_unit], ids=lambda fault: fault.__name__)
+def test_a_planted_fault_is_named(tmp_path: Path, fault: Fault) -> None:
+    assert share_named(tmp_path, fault, 1) == 1.0
+
+
 def test_a_jump_is_named_where_the_noise_looks_larger_by_chance(tmp_path: Path) -> None:
     """Before: the differences of 40 samples gave 1.6 times the noise of the record, and no finding."""
     found = named(lose(rig_of(tmp_path, 6), np.random.default_rng(1006)))

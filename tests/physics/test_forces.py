@@ -15,6 +15,7 @@ from capsule_id.motions.response import response
 from capsule_id.parameters import Parameter
 from capsule_id.physics import forces as steps
 from capsule_id.physics.drive import Excitation
+from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.energy import energy_balance
 from capsule_id.physics.forces import Force, Spring
 from capsule_id.physics.friction import CoulombStribeck, friction
@@ -185,7 +186,7 @@ class _Hertz(Force):
         return self.G
 
     def elastic(self, d: Any) -> Any:
-        return self.k * d**self.p
+        return -(-self.k * d**self.p)
 
 
 @jax.tree_util.register_dataclass
@@ -229,6 +230,17 @@ def test_the_exact_engine_refuses_what_has_no_series_there(call: Callable[..., A
     arguments = (p, Excitation(**DRIVE)) if call is response else (p, Excitation(**DRIVE), TIMES)
     with pytest.raises(InputError, match=r'whole powers .* use simulate with model="smooth"'):
         call(*arguments)
+
+
+def test_the_exact_engine_refuses_a_force_of_ones_own_on_a_prescribed_rod() -> None:
+    """Nothing there would show where the series of the force ends: with d^9 the capsule never set off."""
+    p = CapsuleParameters(**LEAVES, k2=0.0, G=np.inf, forces=(_Whole(1e3, 2, 1e-3),))
+    rod = RodMotion(np.array([0.0, 1.0]), np.array([1e-3, 11e-3]), np.array([0.0, 30e-3]))
+    with pytest.raises(
+        InputError, match=r'the motion of the rod is prescribed, _Whole, use simulate with model="smooth"'
+    ):
+        simulate(p, rod, np.linspace(0.0, 1.0, 5))
+    assert np.isfinite(np.asarray(simulate(p, rod, np.linspace(0.0, 1.0, 5), model="smooth").X2)).all()
 
 
 def test_power_1_is_the_built_in_contact_in_both_engines() -> None:

@@ -401,7 +401,7 @@ def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
         Curve("this fit through the same filter", fitted[0] * unit, fitted[1], role="alternative"),
     ]
     if run.spring is not None:
-        gap = (float(run.with_spring(theta).G) + offset) * unit  # pyright: ignore[reportArgumentType]
+        gap = (float(run.capsule(theta)[0].G) + offset) * unit  # pyright: ignore[reportArgumentType]
         ends = np.array([y.min(), y.max()])
         curves.append(Curve("support spring", np.array([gap, gap]), ends, role="paper"))
     label, points = f"{run.label}_phase_portrait", Points("record, Savitzky–Golay", recorded[0] * unit, recorded[1])

@@ -126,7 +126,7 @@ def halves(changes: Changes) -> Check:
         name = max(found, key=lambda name: abs(found[name][2]))
         first, second, z, matters = found[name]
         facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
-        level = "ok" if abs(z) <= HALVES_DISAGREE else "fail" if abs(z) > HALVES_FAIL and matters else "warn"
+        level = "ok" if not abs(z) > HALVES_DISAGREE else "fail" if abs(z) > HALVES_FAIL and matters else "warn"
         return {**facts, "model": e.model_name, "stated": e.stated_words}, level
 
     return each("decays.halves", judge)
@@ -327,12 +327,12 @@ def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> tuple[dict[str,
     return {name: found.values[name] for name in names}, {name: found.errors[name] for name in names}
 
 
-#: All checks of records of free decays but that on hidden forces, which needs the second fit.
 check_halves = halves(changes_of_second_half)
 check_positions = each("decays.position", position)
 check_size_of_residuals = each("decays.residuals", size_of_residuals)
 check_drift = each("decays.drift", drift, joined=False)
 check_zero = each("decays.zero", zero)
+#: All checks of records of free decays but that on hidden forces, which needs the second fit.
 CHECKS = (
     check_stiffness,
     check_free_decay,

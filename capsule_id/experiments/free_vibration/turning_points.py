@@ -42,8 +42,8 @@ from capsule_id.views import Facts, Finding, Level
 DISAGREE, FAIL = 3.0, 4.0
 #: Fewest turning points that are judged.
 FEWEST_TURNS = 8
-#: Relative step of difference quotients, and passes that estimate the noise levels.
-STEP, PASSES = 1e-5, 4
+#: Passes that estimate the noise levels.
+PASSES = 4
 #: Largest number of Gauss-Newton steps, of their bisections, and change, in sds, below which a fit has converged.
 STEPS, BISECTIONS, CONVERGED = 30, 10, 1e-3
 

@@ -105,6 +105,9 @@ class Taylor:
 
     __radd__, __rmul__ = __add__, __mul__
 
+    def __neg__(self) -> "Taylor":
+        return -1.0 * self
+
     def __sub__(self, other: Any) -> "Taylor":
         return self + -1.0 * other
 
@@ -214,7 +217,17 @@ class StepSeries(NamedTuple):
 
 
 def constants_of(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> Constants:
-    """The constants of a run from lanes of parameters, drive and friction law."""
+    """The constants of a run from lanes of parameters, drive and friction law.
+
+    Raises
+    ------
+    InputError
+        A force of the user's own on a prescribed rod: no series of a motion would show where that of the force ends.
+    """
+    if p.forces and e.prescribed:
+        rule = "the exact engine takes no further forces where the motion of the rod is prescribed"
+        value = ", ".join(type(force).__name__ for force in p.forces)
+        raise InputError(rule, value, 'use simulate with model="smooth"')
     m1, m2 = jnp.asarray(p.m1), jnp.asarray(p.m2)
     still = jnp.zeros_like(m1)
     F_forward, F_backward = (jnp.broadcast_to(F, still.shape) for F in (law.forward(still), law.backward(still)))
