@@ -143,9 +143,8 @@ def test_convergence_recomputed(job: Job) -> None:
     for name in names(job):
         draws, row = job.draws(name), job.parameters["parameters"][name]
         rhat = split_rhat(draws.reshape(len(draws), -1))
-        ess = sum(
-            chain.size / float(emcee.autocorr.integrated_time(chain[..., None], quiet=True)[0]) for chain in draws
-        )
+        times = [float(emcee.autocorr.integrated_time(chain[..., None], quiet=True)[0]) for chain in draws]
+        ess = sum(chain.size / max(tau, 1.0) for chain, tau in zip(draws, times, strict=True))
         assert rhat == pytest.approx(row["rhat"], abs=1e-6)
         assert ess == pytest.approx(row["ess"], rel=1e-6)
         assert rhat <= MAX_RHAT
