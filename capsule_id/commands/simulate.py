@@ -133,7 +133,8 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
     """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
     import numpy as np
 
-    from capsule_id.report.figures.fits import MotionView, overview
+    from capsule_id.records.view import MotionView
+    from capsule_id.report.figures.fits import overview
     from capsule_id.report.figures.style import new_figure, own_style, png
 
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)

@@ -36,23 +36,19 @@ class Gains:
 
 
 @dataclass(frozen=True)
-class RecordView:
-    """A prepared record, SI.
+class MotionView:
+    """A simulated motion, SI, as a ``RecordView`` shows a measured one.
 
-    label, probability : of the record's motion, see ``measured_motion``
     time : (n,)
     channels : raw, (n,) by column name
-    x_rel, rate : (n,) filtered, and its derivative
+    x_rel, rate : (n,) and its derivative; those of a record are filtered
     section_x_rel, section_rate : (m,) where the drive's phase is a multiple of 2 pi, without half windows at the ends
     gap : as stated; infinite without a support spring
     gap_seen : x_rel where contacts begin, None if the record does not determine it
-    force : (n,) K times the current without its offset, N, None without current or K
     samples : window of the filter
-    at_drive, at_contact : the filter's gains; ``at_contact`` is None without contacts
+    label : of a record's motion, see ``measured_motion``; "" of a simulation
     """
 
-    label: str
-    probability: float
     time: np.ndarray
     channels: Mapping[str, np.ndarray]
     x_rel: np.ndarray
@@ -60,9 +56,22 @@ class RecordView:
     section_x_rel: np.ndarray
     section_rate: np.ndarray
     gap: float
-    gap_seen: float | None
+    gap_seen: float | None = None
+    samples: int = 1
+    label: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordView(MotionView):
+    """A prepared record, SI.
+
+    probability : of its label
+    force : (n,) K times the current without its offset, N, None without current or K
+    at_drive, at_contact : the filter's gains; ``at_contact`` is None without contacts
+    """
+
+    probability: float
     force: np.ndarray | None
-    samples: int
     at_drive: Gains
     at_contact: Gains | None
 

@@ -151,7 +151,6 @@ def test_a_study_of_many_rigs_survives_the_death_of_a_worker(
     for name in names:
         small_rig(here / name, name, TABLES["tilts"])
     with client_of("processes") as client:
-        assert client is not None
         pids = list(client.run(os.getpid).values())
         assert len(pids) >= 2, "with one worker there is nobody to take over"
         write, written = many_rigs._write, list[str]()

@@ -79,15 +79,6 @@ def test_the_model_chooses_the_engine(engine: Literal["exact", "smooth"]) -> Non
         assert cast(CapsuleForward, e).smoothing == (None if engine == "exact" else Smoothing())
 
 
-def test_the_panel_of_a_decay_by_the_capsule_model_shows_its_motion() -> None:
-    """Before: internal failure, the nuisances of the closed form with those of the capsule model."""
-    (e,) = make_experiments(bench.rig(decay(2e-3, "capsule")))
-    theta = {**TRUTH, "g": 9.81, "noise_sd": NOISE, "x_start": 2e-3, "y_start": 0.0}
-    panel = e.comparison(theta, [])
-    unit = e.table.columns["x_rel"].to_display
-    np.testing.assert_allclose(panel.curves[0].y, panel.points[0].y, atol=6.0 * NOISE * unit)
-
-
 @pytest.mark.full
 def test_a_small_release_gives_what_the_closed_form_gives() -> None:
     """2 mm is below F_b/k1 = 2.9 mm: the capsule stays where it is."""

@@ -17,8 +17,8 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.experiments.static_friction import StaticFriction
+from capsule_id.inference.ensemble import ChainStore
 from capsule_id.inference.point_stage import fit_points
-from capsule_id.inference.sampling import ChainStore
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.drive import Excitation

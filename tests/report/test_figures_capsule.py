@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from capsule_id.report.figures.fits import MotionView, overview, overview_size, phase_plane
+from capsule_id.records.view import MotionView
+from capsule_id.report.figures.fits import overview, overview_size, phase_plane
 from capsule_id.report.figures.style import new_axes, new_figure, png
 
 

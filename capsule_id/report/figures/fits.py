@@ -4,8 +4,7 @@ A panel is ``(data, ax)`` and draws into ``ax``; labels are plain text.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import zip_longest
 from typing import Any
 
@@ -20,7 +19,7 @@ from scipy import ndimage
 
 from capsule_id.experiments.context import RunRecord
 from capsule_id.inference.result import PointFit
-from capsule_id.records.view import RecordView
+from capsule_id.records.view import MotionView
 from capsule_id.report.columns import SampledParameters, fixed, plain_symbol
 from capsule_id.report.figures.style import (
     BLACK,
@@ -309,23 +308,7 @@ _CHANNELS = {
 }
 
 
-@dataclass(frozen=True)
-class MotionView:
-    """A simulated motion, SI, with the fields of a ``RecordView`` that ``overview`` draws."""
-
-    time: np.ndarray
-    channels: Mapping[str, np.ndarray]
-    x_rel: np.ndarray
-    rate: np.ndarray
-    section_x_rel: np.ndarray
-    section_rate: np.ndarray
-    gap: float
-    gap_seen: float | None = None
-    samples: int = 1
-    label: str = ""
-
-
-def phase_plane(view: RecordView | MotionView, ax: Axes) -> None:
+def phase_plane(view: MotionView, ax: Axes) -> None:
     """Rate against x_rel, with the impact line and the Poincaré points at the drive's phase."""
     # At the ends of a filtered record the derivative is that of a polynomial's edge, and mostly noise.
     inside = slice(view.samples // 2, len(view.time) - view.samples // 2)
@@ -363,7 +346,7 @@ def force_on_rod(record: RunRecord, ax: Axes) -> None:
     set_legend(ax, "upper right")
 
 
-def channel_history(view: RecordView | MotionView, name: str, ax: Axes) -> None:
+def channel_history(view: MotionView, name: str, ax: Axes) -> None:
     """One raw channel against time; x_rel with the gap."""
     label, scale, color = _CHANNELS[name]
     ax.plot(view.time, scale * view.channels[name], color=color, lw=0.7)
@@ -372,12 +355,12 @@ def channel_history(view: RecordView | MotionView, name: str, ax: Axes) -> None:
     set_text(ax, "time, s", label)
 
 
-def overview_size(view: RecordView | MotionView) -> tuple[float, float]:
+def overview_size(view: MotionView) -> tuple[float, float]:
     """Width and height of ``overview``, inches."""
     return 10.0, 1.2 + 1.25 * max(sum(name in view.channels for name in _CHANNELS), 3)
 
 
-def overview(view: RecordView | MotionView, figure: Figure | SubFigure) -> None:
+def overview(view: MotionView, figure: Figure | SubFigure) -> None:
     """Every channel above each other, the phase plane beside them."""
     set_margins(figure, left=1.0)
     names = [name for name in _CHANNELS if name in view.channels]

@@ -7,6 +7,7 @@ from scipy import stats
 
 from capsule_id.inference import proposal as coordinates
 from capsule_id.inference import refinement
+from capsule_id.inference.ensemble import Ensemble, initial_state
 from capsule_id.inference.moves import effective_sample_size, ensemble_time
 from capsule_id.inference.proposal import (
     BlockProposal,
@@ -16,7 +17,7 @@ from capsule_id.inference.proposal import (
     coordinates_of,
 )
 from capsule_id.inference.refinement import Transported, _Rounds, effective_size, refined, tempered
-from capsule_id.inference.sampling import Ensemble, initial_state, pilot, sample
+from capsule_id.inference.sampling import pilot, sample
 from tests.inference.stub import Gaussian
 
 #: Normal prior of the logarithms of both terms: centre, width.
