@@ -130,9 +130,13 @@ def steps_of(number: int) -> int:
     return FEWER_STEPS if number > LONG else STEPS
 
 
-@partial(jax.jit, static_argnames="number")
-def half_cycles(theta: Mapping[str, Any], amplitude: Any, turning_time: Any, number: int) -> HalfCycles:
+@partial(jax.jit, static_argnames=("number", "steps"))
+def half_cycles(
+    theta: Mapping[str, Any], amplitude: Any, turning_time: Any, number: int, steps: int | None = None
+) -> HalfCycles:
     """Integrate ``number`` half cycles from the turning point ``amplitude`` (m, positive) at ``turning_time`` (s).
+
+    ``steps`` are the Runge–Kutta steps of each (default: ``steps_of``).
 
     Within a half cycle dry friction is constant, so the motion is smooth. With x = rest + r cos(phi) and
     x' = -stretch omega r sin(phi) the half cycle is phi = 0 .. pi exactly. r and the time are integrated over phi, so no
@@ -145,7 +149,7 @@ def half_cycles(theta: Mapping[str, Any], amplitude: Any, turning_time: Any, num
     rest = F_dry / k1
     for _ in range(NEWTON_STEPS if "k_cubic" in theta else 0):
         rest = rest - (k1 * rest + k_cubic * rest**3 - F_dry) / (k1 + 3.0 * k_cubic * rest**2)
-    steps = steps_of(number)
+    steps = steps or steps_of(number)
     width = np.pi / steps
 
     def slope(r: Any, cosine: Any, sine: Any, stretch: Any) -> tuple[Any, Any]:

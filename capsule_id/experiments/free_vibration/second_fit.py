@@ -24,6 +24,7 @@ from capsule_id.experiments.free_vibration.models import (
     equilibrium,
     half_cycles,
     interpolate,
+    steps_of,
     viscous_fit,
 )
 from capsule_id.experiments.free_vibration.readings import (
@@ -131,6 +132,8 @@ def starts_of_motion(e: DecayRecord, rough: Decrement) -> dict[str, Start]:
 
 #: Largest number of evaluations in a fit, and relative step of its difference quotients.
 EVALUATIONS, STEP = 40, 1e-5
+#: Most Runge–Kutta steps of a half cycle: x_rel is wrong by up to 5e-6 of the amplitude, which decides no ranking.
+STEPS = 12
 #: Distance of starts from the bounds, and of the start of a term that a nested model lacks.
 INSIDE, ABSENT_TERM = 1e-3, 1e-9
 #: Replaces the effect of an unknown that the record does not depend on.
@@ -174,7 +177,8 @@ def free_symbols(model: DecayModel) -> list[str]:
 def _paths(thetas: Mapping[str, Any], number: int) -> HalfCycles:
     """Half cycles of a batch of parameters."""
     forces = {name: thetas[name] for name in ("k1", "c", "m1", "F_dry", "c_q", "k_cubic")}
-    return jax.vmap(partial(half_cycles, number=number))(forces, thetas["amplitude"], thetas["turning_time"])
+    path = partial(half_cycles, number=number, steps=min(STEPS, steps_of(number)))
+    return jax.vmap(path)(forces, thetas["amplitude"], thetas["turning_time"])
 
 
 @partial(jax.jit, static_argnames="order")
@@ -353,7 +357,7 @@ class Screening:
 
     def motions(self, whole: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
         """Values by symbol and predicted readings (names + 1, n), SI, at as many scaled unknowns."""
-        thetas = {name: jnp.asarray(value) for name, value in self.theta(whole).items()}
+        thetas = self.theta(whole)
         readings = _readings(_paths(thetas, self.number), self.nodes, self.weights, self.order)
         return thetas, self.side * np.asarray(readings)
 
@@ -561,23 +565,23 @@ def _with_noise(
 ) -> Ranking:
     """Choose drift and noise, from the ranking of all of them on records thinned by ``coarse``.
 
-    At high sampling rates no offered noise may be white. Fewer samples then lose little, because they are correlated.
+    Coloured noise is quoted from these: finer readings cost time and hardly tell more. White noise is quoted from all
+    readings where it is white there. Where no offered noise is white, still fewer readings may be.
     """
     best = ranked[0]
     if records[0].table.settings.thin is not None:
         return best
-    fewest = max(coarse, thinning(records[0], FEWEST_PER_PERIOD))
-    # More samples of the same record show the same misfit with more certainty.
-    offered = any(one.white for one in ranked)
-    thin = records[0].model.thin if offered else fewest
-    while thin <= fewest:
-        screenings = [Screening(record, thin) for record in records]
-        rich = rank(screenings, [replace(best.model, noise=others[-1].noise)], best)[0]
-        if rich.white:
-            ranked = rank(screenings, others, rich)
-            return next((replace(one, model=replace(one.model, thin=thin)) for one in ranked if one.white), rich)
-        thin *= 2
-    return replace(best, model=replace(best.model, thin=coarse))
+    thin, fewest = coarse, max(coarse, thinning(records[0], FEWEST_PER_PERIOD))
+    if not any(one.white for one in ranked) and fewest > coarse:
+        thin, ranked = fewest, rank([Screening(record, fewest) for record in records], others, best)
+    chosen = next((one for one in ranked if one.white), None)
+    if chosen is None:
+        return replace(best, model=replace(best.model, thin=coarse))
+    if not chosen.model.whitened:
+        whole = rank([Screening(record) for record in records], [chosen.model], chosen)[0]
+        if whole.white:
+            return whole
+    return replace(chosen, model=replace(chosen.model, thin=thin))
 
 
 class Demanded(NamedTuple):
