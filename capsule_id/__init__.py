@@ -65,9 +65,9 @@ if TYPE_CHECKING:
         CapsuleParameters as CapsuleParameters,
         Status as Status,
         Trajectory as Trajectory,
-        simulate as simulate,
         status_message as status_message,
     )
+    from capsule_id.physics.simulation import simulate as simulate
     from capsule_id.physics.smooth.engine import Smoothing as Smoothing
     from capsule_id.synthetic import synthesize as synthesize
 
@@ -85,7 +85,8 @@ _PUBLIC = {
     "physics.drive": ("Excitation",),
     "physics.drives": ("Pulses", "RecordedDrive", "RodMotion"),
     "physics.energy": ("energy_balance",),
-    "physics.model": ("CapsuleParameters", "Status", "Trajectory", "simulate", "status_message"),
+    "physics.model": ("CapsuleParameters", "Status", "Trajectory", "status_message"),
+    "physics.simulation": ("simulate",),
     "physics.smooth.engine": ("Smoothing",),
     "synthetic": ("synthesize",),
 }

@@ -41,7 +41,8 @@ from capsule_id.parameters import by_index, is_stated
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.forces import warn_of_far_gap
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
+from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.simulation import simulate
 from capsule_id.report.columns import sampled_parameters, table_rows, table_text, verdict_text, wrapped
 from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import figure_of, subfigure_at

@@ -70,7 +70,6 @@ CHECKED = (
     "capsule_id.inference.curvature",
     "capsule_id.inference.moves",
     "capsule_id.inference.marginal",
-    "capsule_id.physics.exact.dense",
     "capsule_id.records",
     "capsule_id.rig.filters",
 )

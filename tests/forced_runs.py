@@ -10,7 +10,8 @@ from capsule_id.experiments.forced_run.twin import RUNS, STEP, SyntheticRun, mak
 from capsule_id.experiments.forced_run.twin import SAMPLES as RECORDED
 from capsule_id.experiments.kind import default_registry
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.synthetic import Truth
 from tests.experiments import bench

@@ -64,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from capsule_id.physics.forces import warn_of_far_gap
-    from capsule_id.physics.model import Status, simulate, status_message
+    from capsule_id.physics.model import Status, status_message
+    from capsule_id.physics.simulation import simulate
     from capsule_id.physics.smooth.engine import Smoothing
     from capsule_id.report.netcdf import write_motion
 

@@ -29,7 +29,8 @@ from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.experiments.point_test import PointTest
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.drive import Drive, Excitation
-from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
+from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Facts, Finding

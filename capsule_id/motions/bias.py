@@ -8,7 +8,8 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.physics.batches import lanes_of
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
+from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
 
 # m/s. The bar "2 % + 1e-6 m/s" reads 2 % of (|v| + this): a capsule that hardly advances is not judged by a quotient.

@@ -15,7 +15,8 @@ from jax.lax import stop_gradient
 from capsule_id.physics.batches import CHUNK, folded
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Status, simulate, without_absent
+from capsule_id.physics.model import CapsuleParameters, Status, without_absent
+from capsule_id.physics.simulation import simulate
 
 #: Periods of a block: short, because the motion is compared with its repetition only at the end of a block.
 BLOCK = 3

@@ -14,8 +14,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.physics.batches import lanes_of
 from capsule_id.physics.drive import Drive
-from capsule_id.physics.exact.dense import values_of
-from capsule_id.physics.exact.engine import initial_lanes, march
+from capsule_id.physics.exact.engine import initial_lanes, march, values_of
 from capsule_id.physics.exact.taylor import constants_of
 from capsule_id.physics.forces import downhill, forces_of
 from capsule_id.physics.friction import FrictionLaw, friction_law, sliding_friction

@@ -18,7 +18,8 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
 from tests.scipy_capsule import simulate_scipy
 
 pytestmark = pytest.mark.benchmark

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from capsule_id.physics.drives import Pulses
-from capsule_id.physics.model import CapsuleParameters, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import states_of
 from tests.scipy_general import pulses, simulate_general
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
+from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
 
 E = Excitation(4.0, 34.56)

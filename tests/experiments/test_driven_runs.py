@@ -10,7 +10,8 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.experiment import CapsuleRun, growth
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives import Pulses, RecordedDrive
-from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
 from tests.rig.faults import fault_of
 
 TRUTH = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.3, "v_s": 0.3, "g": 9.81}

@@ -9,7 +9,7 @@ from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.experiment import SETTLING_PERIODS
 from capsule_id.experiments.forced_run.start_state import rough_start
 from capsule_id.inference.target import LogPosterior
-from capsule_id.physics.model import simulate
+from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity
 from tests.capsule_cases import jit_quickly
 from tests.experiments import bench

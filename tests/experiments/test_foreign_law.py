@@ -23,7 +23,8 @@ from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.friction import CoulombStribeck
-from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Rig, Table
 from tests.experiments import bench
 from tests.rig.folder import RIG_TOML, write_folder

@@ -24,7 +24,8 @@ from capsule_id.inference.tables import check_engine
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
-from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from tests.capsule_cases import jit_quickly
 from tests.experiments.summed_sessions import integrated

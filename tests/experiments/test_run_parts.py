@@ -10,7 +10,7 @@ from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.experiment import better_start
 from capsule_id.experiments.forced_run.start_state import parts_of
 from capsule_id.inference.target import LogPosterior
-from capsule_id.physics.model import simulate
+from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Table
 from tests.experiments import bench
 from tests.forced_runs import make, recorded, table, theta

@@ -17,7 +17,8 @@ from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import equilibrium
-from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Table
 from tests.capsule_cases import jit_quickly
 from tests.experiments import bench

@@ -7,7 +7,8 @@ import pytest
 from capsule_id.motions.lyapunov import largest_exponent
 from capsule_id.motions.response import response, settle
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases
 
 

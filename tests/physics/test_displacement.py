@@ -11,7 +11,8 @@ from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.friction import CoulombStribeck, Scaled, friction_law, scaled
-from capsule_id.physics.model import CapsuleParameters, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import jit_quickly
 
 PERIOD = 1e-3 * np.array([40.0, 60.0, 80.0, 100.0, 140.0])

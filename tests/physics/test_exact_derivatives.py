@@ -11,7 +11,8 @@ from capsule_id.physics.drive import Excitation
 from capsule_id.physics.exact import engine as exact
 from capsule_id.physics.exact.taylor import GAP, NONE, VELOCITY, CapsuleState, Constants, Mode, StepSeries
 from capsule_id.physics.friction import friction_law
-from capsule_id.physics.model import CapsuleParameters, Status, simulate, without_absent
+from capsule_id.physics.model import CapsuleParameters, Status, without_absent
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases, jit_quickly, states_of
 
 LEAVES = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g", "P_d", "Omega", "phase", "X1", "Y1", "X2", "Y2")

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases, states_of
 
 # The threshold force is 2 N: F_b = mu (m1 + m2) g with round numbers.

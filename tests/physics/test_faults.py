@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Status, simulate, status_message
+from capsule_id.physics.model import CapsuleParameters, Status, status_message
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import states_of
 
 # Steps of a lane in these tests: the bound on the time that a set with a period of 1e7 time scales can take.

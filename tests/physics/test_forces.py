@@ -19,7 +19,8 @@ from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.energy import energy_balance
 from capsule_id.physics.forces import Force, Spring
 from capsule_id.physics.friction import CoulombStribeck, friction
-from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import breakaway, force_gate, friction_smooth
 from tests.scipy_capsule import simulate_scipy
 

@@ -23,7 +23,8 @@ from capsule_id.physics.friction import (
     slide_distance,
     sliding_friction,
 )
-from capsule_id.physics.model import CapsuleParameters, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases, assert_both_ways_as_scipy, jit_quickly, states_of
 from tests.scipy_capsule import simulate_scipy
 

@@ -10,7 +10,8 @@ import pytest
 
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
-from capsule_id.physics.model import CapsuleParameters, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import jit_quickly
 
 #: Every term acts, and both contacts close.

@@ -9,7 +9,8 @@ import pytest
 
 from capsule_id.errors import InputError
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
-from capsule_id.physics.model import CapsuleParameters, Status, Trajectory, simulate
+from capsule_id.physics.model import CapsuleParameters, Status, Trajectory
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import jit_quickly, states_of
 
 BOUND = 2_000

@@ -5,7 +5,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from capsule_id.physics.drives import RodMotion
-from capsule_id.physics.model import CapsuleParameters, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import states_of
 from tests.general_cases import DRIVES, read_general_cases
 from tests.scipy_general import simulate_general

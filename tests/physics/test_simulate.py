@@ -11,7 +11,8 @@ import capsule_id as cid
 from capsule_id.errors import InputError
 from capsule_id.physics import batches
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases, jit_quickly, states_of
 
 P = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)

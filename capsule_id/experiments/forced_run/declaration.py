@@ -337,7 +337,7 @@ class RunSettings(ChannelSettings):
 
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[Finding]:
     """Report quantities that the run cannot measure, at rough values."""
-    from capsule_id.experiments.forced_run.checks import feasibility
+    from capsule_id.experiments.forced_run.feasibility import feasibility
     from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
 
     settings = table.settings

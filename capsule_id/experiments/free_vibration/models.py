@@ -136,17 +136,14 @@ def half_cycles(
 ) -> HalfCycles:
     """Integrate ``number`` half cycles from the turning point ``amplitude`` (m, positive) at ``turning_time`` (s).
 
-    ``steps`` are the Runge–Kutta steps of each (default: ``steps_of``).
-
-    Within a half cycle dry friction is constant, so the motion is smooth. With x = rest + r cos(phi) and
-    x' = -stretch omega r sin(phi) the half cycle is phi = 0 .. pi exactly. r and the time are integrated over phi, so no
-    turning point is searched for. The stretch keeps phi increasing under strong quadratic damping. NaN where phi turns
-    back (overdamped).
+    Each takes ``steps`` steps (default: ``steps_of``). Within it dry friction is constant, so the motion is smooth. With
+    x = rest + r cos(phi) and x' = -stretch omega r sin(phi) the half cycle is phi = 0 .. pi exactly. r and the time are
+    integrated over phi, so no turning point is searched for. The stretch keeps phi increasing under strong quadratic
+    damping. NaN where phi turns back (overdamped).
     """
     k1, c, m1 = theta["k1"], theta["c"], theta["m1"]
     F_dry, c_q, k_cubic = (theta.get(name, 0.0) for name in ("F_dry", "c_q", "k_cubic"))
-    omega = jnp.sqrt(k1 / m1)
-    rest = F_dry / k1
+    omega, rest = jnp.sqrt(k1 / m1), F_dry / k1
     for _ in range(NEWTON_STEPS if "k_cubic" in theta else 0):
         rest = rest - (k1 * rest + k_cubic * rest**3 - F_dry) / (k1 + 3.0 * k_cubic * rest**2)
     steps = steps or steps_of(number)
