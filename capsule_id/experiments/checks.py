@@ -21,9 +21,9 @@ LAGS, SAMPLES_PER_LAG = 20, 5
 
 
 def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
-    """(lags,) sample autocorrelation at lags 1 .. lags."""
+    """(lags,) sample autocorrelation at lags 1 .. lags; NaN of equal residuals."""
     r = residuals - np.mean(residuals)
-    power = float(r @ r)
+    power = float(r @ r) or np.nan
     return np.array([float(r[lag:] @ r[:-lag]) for lag in range(1, lags + 1)]) / power
 
 

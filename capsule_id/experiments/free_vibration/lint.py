@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.models import decay_frequency
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
     DAMPING,
@@ -36,7 +37,7 @@ from capsule_id.experiments.lint import (
 from capsule_id.parameters import parameter
 from capsule_id.records.faults import aliases, sampling
 from capsule_id.records.release import FreeDecay, find_free_decay
-from capsule_id.records.tones import frequency_of, length_of_motion, other_tone
+from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, Entry
@@ -118,7 +119,7 @@ def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[
     if first.label == table.label or channel not in table.columns:
         return
     used = window_of(first)
-    ratio = frequency / frequency_of(first["time"][used], first[channel][used])
+    ratio = frequency / decay_frequency(first["time"][used], first[channel][used])
     if not 1.0 / LARGEST_RATIO < ratio < LARGEST_RATIO:
         near = next(
             (f" The ratio is near {words}." for words, r in RATIOS if abs(abs(np.log(ratio)) - np.log(r)) < 0.1), ""
@@ -142,7 +143,7 @@ def _scales(table: Table[Any], rig: Rig, frequency: float, values: np.ndarray) -
 
 def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
     """Report an unusual frequency, and frequencies that the sampling cannot tell from that of the record."""
-    frequency = frequency_of(time, values)
+    frequency = decay_frequency(time, values)
     unusual = [*_scales(table, rig, frequency, values)]
     yield from unusual
     yield from _other_frequency(table, rig, frequency)
@@ -245,7 +246,7 @@ def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterabl
 
 def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
     """Report uneven sampling, and too few samples per period or periods."""
-    frequency, (rate, even) = frequency_of(time, values), sampling(time)
+    frequency, (rate, even) = decay_frequency(time, values), sampling(time)
     try:
         sampling_step(time)
     except InputError as error:

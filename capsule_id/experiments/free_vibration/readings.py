@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.models import decay_frequency
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, phasor
 from capsule_id.records.release import FreeDecay, find_free_decay
-from capsule_id.records.tones import frequency_of
 from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import COUNT, Entry, GroundSettings, NameRule, QuantityRule, WordsRule
@@ -192,7 +192,7 @@ def is_even(time: np.ndarray) -> bool:
 def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READINGS_PER_PERIOD) -> int:
     """Samples per block that leave about ``per_period`` readings a period; 1 for a record that does not oscillate."""
     try:
-        period = 1.0 / frequency_of(time, values)
+        period = 1.0 / decay_frequency(time, values)
     except (InputError, ZeroDivisionError):
         return 1
     return max(1, int(period / per_period / median_step(time[loudest_part(values)])))

@@ -33,7 +33,6 @@ from capsule_id.experiments.free_vibration.readings import (
     DecayModel,
     block_mean,
     block_means,
-    block_size,
     first_periods,
     natural_units,
 )
@@ -41,6 +40,7 @@ from capsule_id.experiments.free_vibration.record import DecayRecord, ReadingTim
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.physics.batches import pool
 from capsule_id.records.tones import noise_level
+from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding
 
 # starts: Starting points of a fit of free decays.
@@ -416,8 +416,8 @@ class Screening:
 
 #: Records are thinned to this many readings per period before their models are ranked.
 READINGS_PER_PERIOD = 16
-#: Fewest readings per period of a thinned record.
-FEWEST_PER_PERIOD = 8
+#: Fewest readings per period of a thinned record, and in all of it.
+FEWEST_PER_PERIOD, FEWEST_READINGS = 8, 80
 #: Largest number of samples of a record that is no free decay.
 LONGEST_UNCUT = 1000
 #: Of forces whose BIC differs by less, the fewest are chosen: with seven alternatives, noise alone often gains this much.
@@ -488,8 +488,10 @@ def response_p(record: DecayRecord, theta: Mapping[str, float]) -> float:
 
 
 def thinning(record: DecayRecord, per_period: float) -> int:
-    """Return the block size that leaves about ``per_period`` readings; no less than that of the record."""
-    return max(record.model.thin, block_size(*record.whole, per_period))
+    """Return the block size that leaves about ``per_period`` readings, and not too few; no less than that of the record."""
+    time = record.whole[0]
+    step = 2.0 * np.pi / (record.rough.Omega_o * per_period * median_step(time))
+    return max(record.model.thin, min(int(step), len(time) // FEWEST_READINGS))
 
 
 @dataclass(frozen=True)
