@@ -8,9 +8,15 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.models import exponential_fit, likelihood_gain, viscous_fit
+from capsule_id.experiments.free_vibration.models import (
+    decay_frequency,
+    exponential_fit,
+    likelihood_gain,
+    viscous_fit,
+)
 from capsule_id.experiments.free_vibration.second_fit import Screening, open_models, rank
 from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.lint import lint
 from tests.experiments import random_decays
 from tests.experiments.test_second_fit import SPRING_FORCE, record
 from tests.scipy_decay import scipy_decay
@@ -46,6 +52,17 @@ def twin(
     time = np.linspace(0.0, rng.uniform(1.0, 4.0) * max(1.0, ratio) * 2.0 * np.pi / omega, samples)
     size = 10 ** rng.uniform(-3.5, -2.0)
     return time, size * (viscous(time, k1, c, m1) + noise * rng.standard_normal(samples)), k1, c, m1
+
+
+def test_the_periods_of_a_strongly_damped_decay_are_counted(tmp_path: Path) -> None:
+    """Fourteen periods of damping ratio 0.6, whose spectrum has no peak. (Before: "1 period", and an alias at 1 N/m.)"""
+    rng, omega = np.random.default_rng(8), 20.0
+    time = np.linspace(0.0, 14.0 * 2.0 * np.pi / omega, 1000)
+    x = 1e-3 * (viscous(time, omega**2, 1.2 * omega, 1.0) + 0.005 * rng.standard_normal(len(time)))
+    assert decay_frequency(time, x) == pytest.approx(omega / (2.0 * np.pi), rel=0.03)
+    rig, kinds = cid.read_rig(folder(tmp_path / "rig", time, x, 1.0)), default_registry()
+    found = lint(rig, kinds, rig.tables)
+    assert "decays.length" not in {finding.code for finding in found}
 
 
 @pytest.mark.full

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import capsule_id as cid
 from capsule_id import cli
@@ -133,6 +134,22 @@ def test_coloured_noise_is_found() -> None:
     (second,), _ = second_models([record(10.0 * ar1(0.9))])
     assert second.model.noise in ("ar1", "arma")
     assert second.model.symbols == ()
+
+
+def test_coloured_noise_is_quoted_from_fewer_readings_that_tell_as_much() -> None:
+    """2000 samples of eight periods: block means of 13 samples give the standard errors to 6 %. (Before: 16 times the cost.)"""
+    time, rng = np.arange(2000) / 4000.0, np.random.default_rng(4)
+    rho = np.exp(-1.0 / (4000.0 * 0.01))
+    noise = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal(len(time)))
+    x = np.asarray(decay(time, {"k1": bench.K1, "c": C, "m1": bench.M1}, RELEASE, 0.0, 30).x_rel) + 10.0 * NOISE * noise
+    table = bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)], "decay")
+    (second,), _ = second_models([FreeVibration(table, bench.rig(table))])
+    assert second.model.noise == "ar1"
+    assert 100 < second.n < 200
+    few, all_of_them = (Screening(second, thin).fit(second.model)[0] for thin in (None, 1))
+    for name in ("k1", "c"):
+        assert few.errors[name] == pytest.approx(all_of_them.errors[name], rel=0.06)
+        assert abs(few.values[name] - all_of_them.values[name]) < 0.2 * all_of_them.errors[name]
 
 
 @pytest.mark.full
