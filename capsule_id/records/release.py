@@ -345,7 +345,9 @@ def _release(record: _Record, begin: int, early: int) -> tuple[int, _Fit, float 
     """
     fit = record.fit(begin, record.end(begin), record.starts(), 15)
     one = record.fit(early, record.end(early), [fit.poles], 8) if early < begin else fit
-    if abs(np.log(one.poles[0] / fit.poles[0])) < ALIKE and abs(one.poles[1] - fit.poles[1]) < ALIKE:
+    # Less than a period shows no poles that could be compared.
+    short = record.time[-1] - record.time[begin] < record.period
+    if short or (abs(np.log(one.poles[0] / fit.poles[0])) < ALIKE and abs(one.poles[1] - fit.poles[1]) < ALIKE):
         begin, fit = early, one
     seen = [(begin, fit.sd)]
     while begin > 0:
