@@ -1,7 +1,7 @@
 """Nonlinear least squares from several starts, by derivatives or by differences."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -39,10 +39,6 @@ class HasJacobian(Protocol):
         """Residuals (n,) and Jacobian (n, d) at v (d,)."""
         ...
 
-
-FIRST_DAMPING = 1e-6
-"""Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
-strongly correlated. Heavy damping would stop a start near the minimum as if it had converged."""
 
 SMALLEST_EFFECT = 0.01
 """Dimensionless. Smallest effect of a parameter on the residuals, relative to the strongest parameter, when it changes
@@ -99,11 +95,14 @@ class Solver:
         tolerance (1 + its size)
     max_steps : solver steps, rejected ones included, after which a start counts as stalled
     heavy : residuals take milliseconds, so the code is optimised and parameters are scaled by effect (Marquardt 1963)
+    damping : of the first step beside the squared column norms of heavy residuals, dimensionless. Their parameters are
+        strongly correlated: heavy damping would stop a start near the minimum as if it had converged
     """
 
     tolerance: float = 1e-9
     max_steps: int = 1024
     heavy: bool = False
+    damping: float = 1e-6
 
 
 #: Default solver settings.
@@ -138,16 +137,7 @@ def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVE
     descend = partial(_descend, partial(_linearised, residual, solver.heavy), solver=solver)
     # The first start compiles the programs that all threads then call.
     ends = [descend(starts[0]), *pool().map(descend, starts[1:])]
-    x, residuals, jacobian, steps, message = zip(*ends, strict=True)
-    return LeastSquaresFit(
-        x=np.stack(x),
-        cost=0.5 * np.sum(np.stack(residuals) ** 2, axis=1),
-        stalled=np.array([reason != "" for reason in message]),
-        steps=np.array(steps),
-        message=message,
-        residuals=np.stack(residuals),
-        jacobian=np.stack(jacobian),
-    )
+    return _fit_of(ends)
 
 
 class _End(NamedTuple):
@@ -160,12 +150,25 @@ class _End(NamedTuple):
     message: str
 
 
+def _fit_of(ends: "Sequence[_End]") -> LeastSquaresFit:
+    x, residuals, jacobian, steps, message = zip(*ends, strict=True)
+    return LeastSquaresFit(
+        x=np.stack(x),
+        cost=0.5 * np.sum(np.stack(residuals) ** 2, axis=1),
+        stalled=np.array([reason != "" for reason in message]),
+        steps=np.array(steps),
+        message=message,
+        residuals=np.stack(residuals),
+        jacobian=np.stack(jacobian),
+    )
+
+
 def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
     """Levenberg-Marquardt from one start (d,)."""
     residuals, jacobian = linearise(start)
     if not all_finite(jacobian, residuals):
         return _End(start, residuals, jacobian, 1, "The residuals or their Jacobian are not finite: try another start.")
-    scale, unit = (_effects if solver.heavy else _scales)(jacobian, start)
+    scale, unit = _effects(jacobian, solver.damping) if solver.heavy else _scales(jacobian, start)
     method = optx.LevenbergMarquardt(rtol=solver.tolerance, atol=solver.tolerance, linear_solver=lx.QR())
     known, v = _Known(residuals / unit, jacobian * scale / unit), jnp.asarray(start / scale)
     state, steps, converged = _FIRST(method, known, v), 0, False
@@ -273,13 +276,13 @@ _PROGRAMS: dict[bool, Callable[..., Any]] = {
 }
 
 
-def _effects(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
+def _effects(jacobian: Jacobian, damping: float) -> tuple[np.ndarray, float]:
     """Scale as ``_scales`` does, but give every column of the Jacobian the same norm, the unit of the residuals."""
     column_norm = np.linalg.norm(jacobian, axis=0)
     unit = float(np.max(column_norm)) or 1.0
-    scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), np.ones_like(start))
+    scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), 1.0)
     # The solver's initial damping is 1. Larger residual units reduce its effect by their square.
-    return scale, float(np.sqrt(FIRST_DAMPING)) * unit
+    return scale, float(np.sqrt(damping)) * unit
 
 
 def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
@@ -295,61 +298,32 @@ def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     return scale, unit if unit > 0 else 1.0
 
 
-# difference descent: Levenberg-Marquardt by differences, for models whose residuals have kinks in the parameters.
+# difference descent: Derivatives by differences, for models whose residuals have kinks in the parameters.
 #
 # Derivatives at a point say little about a motion that sticks a step later on its other side. Differences over a finite
-# step smooth the kinks, and the log-posterior of many damped steps is computed in one batch.
+# step smooth the kinks, and a batch computes the residuals of all of them.
 
 
 #: Rows of a batch of residuals.
 ROWS = 8
 #: Step of the differences: relative, or part of the prior's sd where u is not a logarithm.
 DIFFERENCE = 2e-3
-#: Dampings that one batch tries, relative to the diagonal of J'J.
-DAMPINGS = np.geomspace(1e-5, 1e3, 16)
-#: Largest change of a logarithm in one step, and of another parameter in prior sds.
-LONGEST_STEP = 0.7
-#: A step that lowers the cost by less than this part of it is the last one; largest number of steps.
-LEAST_DECREASE, MAX_STEPS = 3e-3, 10
+#: Solver settings. Where derivatives change within a step, a light first damping leads to a wrong maximum.
+KINKED = Solver(tolerance=3e-3, max_steps=20, heavy=True, damping=1e-2)
 
 
-def descend(target: LogPosterior, u: np.ndarray, most: int = MAX_STEPS) -> LeastSquaresFit:
+def descend(target: LogPosterior, u: np.ndarray, most: int = KINKED.max_steps) -> LeastSquaresFit:
     """Minimise half the squared residuals over the located parameters from u (d,) in ``most`` steps; the scatters stay."""
     located = target.located
-    scale = np.where(target.positive, 1.0, target.prior_sd)[located]
-    step, u = DIFFERENCE * scale, u.copy()
-    steps = 0
-    while steps < most:
-        steps += 1
-        stop_if_interrupted()
+    step = DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd)[located]
+
+    def differences(x: np.ndarray) -> tuple[Residuals, Jacobian]:
         points = np.repeat(u[None], len(located) + 1, axis=0)
-        points[1:, located] += np.diag(step)
+        points[:, located] = np.concatenate([x[None], x + np.diag(step)])
         residuals = rows_of(target, points)
-        jacobian = (residuals[1:] - residuals[0]).T / step
-        cost = 0.5 * float(residuals[0] @ residuals[0])
-        if not (np.isfinite(jacobian).all() and np.isfinite(cost)):
-            break
-        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residuals[0]
-        damped = normal + DAMPINGS[:, None, None] * np.diag(np.diag(normal))
-        moves = -np.linalg.solve(damped, np.broadcast_to(gradient, (len(damped), len(step)))[..., None])[..., 0]
-        moves /= np.maximum(1.0, np.max(np.abs(moves / scale), axis=1, keepdims=True) / LONGEST_STEP)
-        trials = np.repeat(u[None], len(moves), axis=0)
-        trials[:, located] += moves
-        costs = 0.5 * np.sum(rows_of(target, trials) ** 2, axis=1)
-        best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-        if costs[best] < cost:
-            u = trials[best]
-        if not costs[best] < (1.0 - LEAST_DECREASE) * cost:
-            break
-    return LeastSquaresFit(
-        x=u[located][None],
-        cost=np.array([cost]),
-        stalled=np.array([not np.isfinite(cost)]),
-        steps=np.array([steps]),
-        message=("",),
-        residuals=residuals[:1],
-        jacobian=jacobian[None],
-    )
+        return residuals[0], (residuals[1:] - residuals[0]).T / step
+
+    return _fit_of([_descend(differences, u[located], replace(KINKED, max_steps=most))])
 
 
 def rows_of(target: LogPosterior, u: np.ndarray) -> np.ndarray:
