@@ -123,11 +123,11 @@ BATCH = 32
 
 
 def in_batches(
-    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"]
+    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"], rows: int = BATCH
 ) -> Float[np.ndarray, "m ..."]:
-    """Evaluate ``function`` at points (m, d) in batches of exactly ``BATCH`` rows, on all cores; (m, ...)."""
-    padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % BATCH, axis=0)])
-    chunks = [padded[i : i + BATCH] for i in range(0, len(padded), BATCH)]
+    """Evaluate ``function`` at points (m, d) in batches of exactly ``rows`` rows, on all cores; (m, ...)."""
+    padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % rows, axis=0)])
+    chunks = [padded[i : i + rows] for i in range(0, len(padded), rows)]
     parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
     return np.concatenate(parts)[: len(points)]
 

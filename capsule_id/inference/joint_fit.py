@@ -236,7 +236,7 @@ def _compile_descent(target: LogPosterior) -> None:
     """Compile what ``_descend`` computes at a point."""
     u = dispersed_starts(target, 0, 1)
     if any(e.has_joint_scatters for e in target.experiments):
-        difference_descent.rows_of(target, u)
+        in_batches(partial(difference_descent.rows_of, target), u, difference_descent.ROWS)
     else:
         linearised(HeldResiduals(target, jnp.asarray(u[0])), u[0, target.located])
 

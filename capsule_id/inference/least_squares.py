@@ -13,7 +13,15 @@ import numpy as np
 import optimistix as optx
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.inference.curvature import Covariance, Jacobian, Residuals, all_finite, column_space, covariance
+from capsule_id.inference.curvature import (
+    Covariance,
+    Jacobian,
+    Residuals,
+    all_finite,
+    column_space,
+    covariance,
+    in_batches,
+)
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.batches import pool
 from capsule_id.precision import COMPILE, COMPILE_QUICKLY, require_float64
@@ -320,24 +328,13 @@ def descend(target: LogPosterior, u: np.ndarray, most: int = KINKED.max_steps) -
     def differences(x: np.ndarray) -> tuple[Residuals, Jacobian]:
         points = np.repeat(u[None], len(located) + 1, axis=0)
         points[:, located] = np.concatenate([x[None], x + np.diag(step)])
-        residuals = rows_of(target, points)
+        residuals = in_batches(partial(rows_of, target), points, ROWS)
         return residuals[0], (residuals[1:] - residuals[0]).T / step
 
     return _fit_of([_descend(differences, u[located], replace(KINKED, max_steps=most))])
 
 
-def rows_of(target: LogPosterior, u: np.ndarray) -> np.ndarray:
-    """(m, n) residuals at u (m, d)."""
-    padded = np.concatenate([u, np.repeat(u[-1:], -len(u) % ROWS, axis=0)])
-    first, *rest = np.split(padded, len(padded) // ROWS)
-    # The first batch compiles the program that all threads then call.
-    parts = [
-        np.asarray(_residuals(target, first)),
-        *pool().map(lambda part: np.asarray(_residuals(target, part)), rest),
-    ]
-    return np.concatenate(parts)[: len(u)]
-
-
 @partial(jax.jit, compiler_options=COMPILE)
-def _residuals(target: LogPosterior, u: jax.Array) -> jax.Array:
+def rows_of(target: LogPosterior, u: jax.Array) -> jax.Array:
+    """(m, n) residuals at u (m, d)."""
     return jax.vmap(target.residuals)(u)
