@@ -256,9 +256,9 @@ def compare_points(
     table = _table(
         {name: {**row, "difference": row["log_evidence"] - highest} for name, row in rows.items()}, "log_evidence"
     )
-    chosen = table.index[table["difference"] >= -STRONG]
-    recommended = str(table.loc[chosen, "parameters"].idxmin())
-    behind: Mapping[Any, float] = table["difference"].to_dict()
+    behind = {str(name): float(rows[str(name)]["log_evidence"] - highest) for name in table.index}
+    close = [name for name, difference in behind.items() if difference >= -STRONG]
+    recommended = min(close, key=lambda name: rows[name]["parameters"])
     said = _recommendation(
         recommended, choices[recommended], f"{STRONG:g} of the best log-evidence ({behind[recommended]:.1f})"
     )
@@ -266,7 +266,7 @@ def compare_points(
     return Choice(table, recommended, f"{said}\nRejected: {', '.join(rejected)}." if rejected else said)
 
 
-def _table(rows: Mapping[str, Mapping[str, Any]], criterion: str) -> pd.DataFrame:
+def _table(rows: dict[str, dict[str, Any]], criterion: str) -> pd.DataFrame:
     """Table of the variants, that with the highest ``criterion`` first."""
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("variant")
     return frame.sort_values(criterion, ascending=False, kind="stable")

@@ -171,7 +171,7 @@ def joint_fit(
         raise _not_finite(target, ends[best].fit, len(starts))
     fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
-    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0).matrix
+    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0]).matrix
     scatters = np.flatnonzero(target.scatter)
     matrix[scatters, scatters] = _scatter_variances(target, u[best])
     return described(

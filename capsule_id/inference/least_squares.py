@@ -14,12 +14,10 @@ import optimistix as optx
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.inference.curvature import (
-    Covariance,
     Jacobian,
     Residuals,
     all_finite,
     column_space,
-    covariance,
     in_batches,
 )
 from capsule_id.inference.target import LogPosterior
@@ -67,8 +65,6 @@ class LeastSquaresFit:
     cost : (s,) ½ Σ r², units of the residuals squared
     stalled : (s,) bool, no convergence: too many steps, non-finite values, or vanishing steps away from a stationary
         point
-    steps : (s,) solver steps, rejected ones included
-    message : (s,) the reason, "" where it converged
     residuals : (s, n) at the end points
     jacobian : (s, n, d) of the residuals at the end points
     """
@@ -76,21 +72,8 @@ class LeastSquaresFit:
     x: np.ndarray
     cost: np.ndarray
     stalled: np.ndarray
-    steps: np.ndarray
-    message: tuple[str, ...]
     residuals: np.ndarray
     jacobian: np.ndarray
-
-    @property
-    def best(self) -> int:
-        """Index of the start with the smallest finite cost among those that converged, or among all if none did."""
-        candidates = self.stalled if self.stalled.all() else ~self.stalled
-        return int(np.argmin(np.where(candidates & np.isfinite(self.cost), self.cost, np.inf)))
-
-    def covariance(self, residual_sd: float | None = None, start: int | None = None) -> Covariance:
-        """Covariance at the end point of ``start`` (default: the best one); see the function ``covariance``."""
-        index = self.best if start is None else start
-        return covariance(self.jacobian[index], self.residuals[index], residual_sd)
 
 
 @dataclass(frozen=True)
@@ -149,23 +132,20 @@ def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVE
 
 
 class _End(NamedTuple):
-    """Where one start ended: x (d,), residuals (n,) and Jacobian (n, d) there, steps, reason for no convergence."""
+    """Where one start ended: x (d,), residuals (n,) and Jacobian (n, d) there, and whether it is no minimum."""
 
     x: np.ndarray
     residuals: np.ndarray
     jacobian: np.ndarray
-    steps: int
-    message: str
+    stalled: bool
 
 
 def _fit_of(ends: "Sequence[_End]") -> LeastSquaresFit:
-    x, residuals, jacobian, steps, message = zip(*ends, strict=True)
+    x, residuals, jacobian, stalled = zip(*ends, strict=True)
     return LeastSquaresFit(
         x=np.stack(x),
         cost=0.5 * np.sum(np.stack(residuals) ** 2, axis=1),
-        stalled=np.array([reason != "" for reason in message]),
-        steps=np.array(steps),
-        message=message,
+        stalled=np.array(stalled),
         residuals=np.stack(residuals),
         jacobian=np.stack(jacobian),
     )
@@ -175,7 +155,7 @@ def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
     """Levenberg-Marquardt from one start (d,)."""
     residuals, jacobian = linearise(start)
     if not all_finite(jacobian, residuals):
-        return _End(start, residuals, jacobian, 1, "The residuals or their Jacobian are not finite: try another start.")
+        return _End(start, residuals, jacobian, True)
     scale, unit = _effects(jacobian, solver.damping) if solver.heavy else _scales(jacobian, start)
     method = optx.LevenbergMarquardt(rtol=solver.tolerance, atol=solver.tolerance, linear_solver=lx.QR())
     known, v = _Known(residuals / unit, jacobian * scale / unit), jnp.asarray(start / scale)
@@ -195,12 +175,9 @@ def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
             known = _Known(np.full_like(at_trial, np.inf), np.zeros_like(slopes))
     x = np.asarray(v) * scale
     residuals, jacobian = linearise(x)
-    if not converged and steps == solver.max_steps:
-        return _End(x, residuals, jacobian, steps, "The maximum number of steps was reached: try another start.")
     # The solver tests step sizes only, and heavy damping makes steps small far from a minimum.
-    stationary = _stationary(jacobian, residuals, solver.tolerance * unit)
-    reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
-    return _End(x, residuals, jacobian, steps, "" if stationary else reason)
+    short = not converged and steps == solver.max_steps
+    return _End(x, residuals, jacobian, short or not _stationary(jacobian, residuals, solver.tolerance * unit))
 
 
 class _Known(eqx.Module):

@@ -275,7 +275,7 @@ def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, fl
         density += np.log(np.cosh(x)) + np.mean(0.5 * np.log(variance), axis=1) * np.sum(hat[rows])
         weight = np.exp(density - np.max(density))
         jacobian[rows] *= (misfit.at(own[symbol], np).sd / np.sqrt(weight @ variance / np.sum(weight)))[:, None]
-    matrix = covariance(jacobian, np.zeros(len(jacobian)), residual_sd=1.0)
+    matrix = covariance(jacobian)
     errors = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
     return {**fit.standard_errors, **{target.names[i]: float(sd) for i, sd in zip(located, errors, strict=True)}}
 
