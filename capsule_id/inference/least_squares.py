@@ -294,7 +294,7 @@ ROWS = 8
 #: Step of the differences: relative, or part of the prior's sd where u is not a logarithm.
 DIFFERENCE = 2e-3
 #: Solver settings. Where derivatives change within a step, a light first damping leads to a wrong maximum.
-KINKED = Solver(tolerance=3e-3, max_steps=20, heavy=True, damping=1e-2)
+KINKED = Solver(tolerance=3e-3, max_steps=20, heavy=True, damping=1e-3)
 
 
 def descend(target: LogPosterior, u: np.ndarray, most: int = KINKED.max_steps) -> LeastSquaresFit:
