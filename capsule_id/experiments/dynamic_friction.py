@@ -21,7 +21,7 @@ from capsule_id.experiments.friction import (
     unit_law,
     weight_along,
 )
-from capsule_id.experiments.friction_variants import CHECKS, TABLES
+from capsule_id.experiments.friction_variants import CHECKS
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors
 from capsule_id.parameters import Prior, scatter
@@ -215,7 +215,7 @@ class DynamicFriction(FrictionExperiment):
     """
 
     role, reading, scatter = "dynamic", "distance", PUSH_SCATTER
-    checks, tables = CHECKS, TABLES
+    checks = CHECKS
 
     @property
     def masses(self) -> tuple[str, ...]:

@@ -1,6 +1,5 @@
 """Friction experiments: shared declarations, the paper's protocol, one panel, pulls, and the consistency of the surface."""
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import numpy as np
-from scipy.optimize import OptimizeWarning, curve_fit
+from scipy.optimize import least_squares
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol, band
@@ -194,22 +193,16 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
     if len(np.unique(speed)) < 2:
         return {}
     start = (float(np.max(coefficient)), float(np.median(speed[sliding])))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", OptimizeWarning)
-            (mu, v_s), covariance = curve_fit(
-                lambda v, mu, v_s: unit_law(mu, v_s).forward(v),
-                speed,
-                coefficient,
-                p0=start,
-                bounds=([0.0, LOWEST_V_S], [np.inf, np.inf]),
-            )
-    except RuntimeError:
+    bounds = [0.0, LOWEST_V_S], [np.inf, np.inf]
+    found = least_squares(lambda own: unit_law(*own).forward(speed) - coefficient, start, bounds=bounds)
+    if not found.success:
         return {}
+    mu, v_s = found.x
     if v_s < 1.01 * LOWEST_V_S:
         return {}
+    variance = np.linalg.pinv(found.jac.T @ found.jac)[1, 1] * 2.0 * found.cost / max(len(speed) - 2, 1)
     # Two points determine both values, without a standard error.
-    known = v_s <= LARGEST_V_S * np.max(speed) and (len(speed) == 2 or np.sqrt(covariance[1, 1]) <= v_s)
+    known = v_s <= LARGEST_V_S * np.max(speed) and (len(speed) == 2 or np.sqrt(variance) <= v_s)
     return {"mu": float(mu), "v_s": float(v_s)} if known else {"mu": float(mu)}
 
 

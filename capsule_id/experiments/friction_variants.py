@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pandas as pd
 from scipy import special
 
 from capsule_id.experiments.checks import LEVEL
@@ -14,7 +13,7 @@ from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Rever
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior
 from capsule_id.physics.friction import CoulombStribeck
-from capsule_id.views import Finding, ResultTable
+from capsule_id.views import Finding
 
 # friction variants: Variants of the friction law, compared by their marginal likelihoods on the friction experiments.
 #
@@ -259,22 +258,8 @@ def check_variants(experiments: Sequence[FrictionExperiment], fit: Fitted) -> li
         "simplest": simplest.model.name,
         "line": simplest.line,
         "p": used.lack_of_fit,
-        "variants": tuple(variants),
     }
     names = tuple(row.name for row in in_use.parameters)
-    rejected, ordered = facts["factor"] > FACTOR, used.lack_of_fit < LEVEL
-    return [
-        Finding("friction.variants", "fail" if rejected else "ok", facts, parameters=names),
-        Finding("friction.order", "fail" if ordered else "ok", facts, parameters=names),
-    ]
-
-
-def variant_table(experiments: Sequence[FrictionExperiment], fit: Fitted) -> list[ResultTable]:
-    """Show the laws of ``check_variants`` side by side."""
-    del experiments
-    variants = next((f.facts["variants"] for f in fit.findings if f.code == "friction.variants"), ())
-    if not variants:
-        return []
     rows = [
         {
             "law": variant.model.name,
@@ -283,14 +268,18 @@ def variant_table(experiments: Sequence[FrictionExperiment], fit: Fitted) -> lis
             ),
             "log-likelihood": variant.log_likelihood,
             "BIC": variant.bic - min(other.bic for other in variants),
-            "log marginal likelihood": variant.evidence - max(other.evidence for other in variants),
+            "log marginal likelihood": variant.evidence - highest,
             "order of residuals, p": variant.lack_of_fit,
             "[model]": variant.line,
         }
         for variant in variants
     ]
-    return [ResultTable("friction.variants", pd.DataFrame(rows).set_index("law"))]
+    rejected, ordered = facts["factor"] > FACTOR, used.lack_of_fit < LEVEL
+    return [
+        Finding("friction.variants", "fail" if rejected else "ok", {**facts, "alternatives": rows}, parameters=names),
+        Finding("friction.order", "fail" if ordered else "ok", facts, parameters=names),
+    ]
 
 
-#: Checks and tables of friction experiments.
-CHECKS, TABLES = (check_one_surface, check_variants), (variant_table,)
+#: Checks of friction experiments.
+CHECKS = (check_one_surface, check_variants)

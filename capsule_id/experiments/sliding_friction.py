@@ -17,7 +17,7 @@ from capsule_id.experiments.friction import (
     friction_panels,
     lint_slides,
 )
-from capsule_id.experiments.friction_variants import CHECKS, TABLES
+from capsule_id.experiments.friction_variants import CHECKS
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.model import Table
@@ -120,4 +120,4 @@ class SlidingFriction(Pulls):
     """Steady sliding. Without a speed the friction must not depend on it."""
 
     role, scatter = "sliding", SLIDING_SCATTER
-    checks, tables = CHECKS, TABLES
+    checks = CHECKS

@@ -22,7 +22,7 @@ from capsule_id.experiments.friction import (
     friction_panels,
 )
 from capsule_id.experiments.friction_model import FrictionModel
-from capsule_id.experiments.friction_variants import CHECKS, TABLES
+from capsule_id.experiments.friction_variants import CHECKS
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
@@ -169,7 +169,7 @@ class StaticFriction(FrictionExperiment):
     """
 
     role, reading, scatter, relative, on_track = "static", "angle", TILT_SD, False, False
-    checks, tables = CHECKS, TABLES
+    checks = CHECKS
 
     @classmethod
     def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> tuple[FrictionExperiment, ...]:
@@ -210,4 +210,4 @@ class StaticPulls(Pulls):
     """Pulls along the track until the capsule slips."""
 
     role, scatter = "static", PULL_SCATTER
-    checks, tables = CHECKS, TABLES
+    checks = CHECKS

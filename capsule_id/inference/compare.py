@@ -33,17 +33,30 @@ from capsule_id.views import counted
 # variants: Variants of the model of a rig: one choice of ``[model]`` at a time takes each of its alternatives.
 
 
-#: Words of ``--compare``.
-WORDS = ("friction", "reaction", "lag", "cubic")
 #: Parameters of the friction law that may be free.
 FRICTION = ("mu_back", "ratio", "viscous")
+#: Alternatives by the word of ``--compare``: name, other choices, and the free symbols that go and come.
+ALTERNATIVES: Mapping[str, Sequence[tuple[str, Mapping[str, Any], Sequence[str], Sequence[str]]]] = {
+    "friction": (
+        ("constant friction", {"friction": "constant"}, FRICTION, ()),
+        ("eq. (1)", {"friction": "stribeck"}, FRICTION, ()),
+        ("free ratio", {"friction": "stribeck"}, FRICTION, ("ratio",)),
+        ("viscous part", {}, (), ("viscous",)),
+        ("direction", {}, (), ("mu_back",)),
+    ),
+    "reaction": (
+        ("reaction on the capsule", {"reaction": "capsule"}, (), ()),
+        ("reaction on the ground", {"reaction": "ground"}, (), ()),
+    ),
+    "lag": (("no lag", {}, ("lag",), ()), ("free lag", {}, (), ("lag",))),
+    "cubic": (("linear spring", {}, ("k_cubic",), ()), ("cubic spring", {}, (), ("k_cubic",))),
+}
+#: Words of ``--compare``.
+WORDS = tuple(ALTERNATIVES)
 
 
 def variants_of(rig: Rig, words: Sequence[str]) -> dict[str, ModelChoices]:
-    """The choices to compare by name: those of the rig first ("as stated"), equal ones once.
-
-    friction: constant, eq. (1), free ratio, and the law of the rig with a viscous part and with a direction;
-    reaction: on the ground, on the capsule; lag: none, free; cubic: a linear spring, k_cubic free.
+    """The choices to compare by name: those of the rig first ("as stated"), then ``ALTERNATIVES``, equal ones once.
 
     Raises
     ------
@@ -54,33 +67,13 @@ def variants_of(rig: Rig, words: Sequence[str]) -> dict[str, ModelChoices]:
     if unknown or not words:
         rule = f"--compare takes some of {','.join(WORDS)}"
         raise InputError(rule, ",".join(words) or "nothing", f"write --compare {WORDS[0]}")
-    model = rig.model
-    others = tuple(symbol for symbol in model.free if symbol not in FRICTION)
-    found = {"as stated": model}
-    if "friction" in words:
-        found["constant friction"] = replace(model, friction="constant", free=others)
-        found["eq. (1)"] = replace(model, friction="stribeck", free=others)
-        found["free ratio"] = replace(model, friction="stribeck", free=("ratio", *others))
-        found["viscous part"] = _with(model, "viscous")
-        found["direction"] = _with(model, "mu_back")
-    if "reaction" in words:
-        found["reaction on the capsule"] = replace(model, reaction="capsule")
-        found["reaction on the ground"] = replace(model, reaction="ground")
-    for word, symbol, absent, present in (
-        ("lag", "lag", "no lag", "free lag"),
-        ("cubic", "k_cubic", "linear spring", "cubic spring"),
-    ):
-        if word in words:
-            found[absent] = replace(model, free=tuple(s for s in model.free if s != symbol))
-            found[present] = _with(model, symbol)
-    unique: dict[tuple[object, ...], str] = {}
-    for name, choices in found.items():
-        unique.setdefault((choices.friction, frozenset(choices.free), choices.reaction), name)
-    return {name: found[name] for name in unique.values()}
-
-
-def _with(model: ModelChoices, symbol: str) -> ModelChoices:
-    return model if symbol in model.free else replace(model, free=(*model.free, symbol))
+    found = {"as stated": rig.model}
+    for name, other, gone, free in (row for word, rows in ALTERNATIVES.items() if word in words for row in rows):
+        kept = [symbol for symbol in rig.model.free if symbol not in (*gone, *free)]
+        model = replace(rig.model, **other, free=(*kept, *free))
+        if all(replace(model, free=one.free) != one or {*model.free} != {*one.free} for one in found.values()):
+            found[name] = model
+    return found
 
 
 # compare: Fits nested variants of the model side by side and recommends the simplest one that predicts as well as the
@@ -97,92 +90,49 @@ STRONG = 3.0
 #: A variant is hopeless, and has no refits, where it is worse by this much and this many standard errors. Smaller
 #: differences mean little (Sivula, Magnusson, Matamoros & Vehtari 2020).
 HOPELESS, HOPELESS_ERRORS = 4.0, 5.0
+#: Last line of a comparison of point fits.
+ROUGH = (
+    "This comparison is rough: it uses a normal approximation at the best point of each variant. Compare without "
+    "--no-sample before you choose."
+)
 
 
 @dataclass(frozen=True)
-class PointChoice:
-    """Nested variants of the model of a rig, compared by their point fits alone.
+class Choice:
+    """Nested variants of the model of a rig, compared by the predictions of settings left out, or by their point fits.
 
     Attributes
     ----------
-    table : a row per variant (index ``variant``), the best first: parameters, log_posterior (the maximum), converged,
-        log_evidence and its difference from the best
-    recommended : the variant with the fewest parameters whose log-evidence is within ``STRONG`` of the best
-    choices : the choices of ``[model]`` by variant
+    table : a row per variant (index ``variant``), the best first: parameters, difference from the best, log_evidence; of
+        predictions also elpd, the standard errors se and of log_evidence, shape (largest Pareto shape of the densities
+        that enter), and refits, none where a variant is far worse than the best; of point fits log_posterior (the
+        maximum) and converged
+    recommended : the variant with the fewest parameters within ``STANDARD_ERRORS`` of the best, of point fits within
+        ``STRONG``
+    line : the recommendation in words, with the lines of ``[model]``, and what is uncertain
+    predictions : of the recommended variant, see ``capsule_id.inference.leave_out.left_out_predictions``; None for point
+        fits
     """
 
     table: pd.DataFrame
     recommended: str
-    choices: Mapping[str, ModelChoices]
-
-    @property
-    def line(self) -> str:
-        """The recommendation in words, with the lines of ``[model]``, and the variants that the readings reject."""
-        behind = self.table["difference"]
-        said = (
-            f"{self.recommended}: the simplest variant within {STRONG:g} of the best log-evidence "
-            f"({behind[self.recommended]:.1f}). Write in [model]: {self._model}"
-        )
-        rejected = [f"{name} ({value:.1f})" for name, value in behind.to_dict().items() if value < -STRONG]
-        return f"{said}\nRejected: {', '.join(rejected)}." if rejected else said
-
-    @property
-    def _model(self) -> str:
-        """The choices of the recommended variant, as in ``[model]``."""
-        own = self.choices[self.recommended]
-        free = ", ".join(f'"{symbol}"' for symbol in own.free)
-        return f'friction = "{own.friction}", reaction = "{own.reaction}", free = [{free}]'
+    line: str
+    predictions: pd.DataFrame | None = None
 
     @property
     def text(self) -> str:
-        """The table, the recommendation, and how rough both are."""
-        rough = (
-            "This comparison is rough: it uses a normal approximation at the best point of each variant. Compare without "
-            "--no-sample before you choose."
-        )
-        return "\n".join([self.table.round(2).to_string(), self.line, rough])
+        """The tables, the recommendation, and how well the recommended variant predicts or how rough a comparison is."""
+        first = [self.table.round(2).to_string(), self.line]
+        if self.predictions is None:
+            return "\n".join([*first, ROUGH])
+        return "\n".join([*first, "", self.predictions.round(2).to_string(), predictions_text(self.predictions)])
 
 
-@dataclass(frozen=True)
-class Choice(PointChoice):
-    """Nested variants of the model of a rig, compared by the predictions of settings left out.
-
-    Attributes
-    ----------
-    table : a row per variant (index ``variant``), the best first: parameters, elpd, its difference from the best and
-        the standard error of the difference, log_evidence and its standard error, shape (largest Pareto shape of the
-        densities that enter), refits; none where a variant is far worse than the best
-    recommended : the variant with the fewest parameters within two standard errors of the best
-    predictions : of the recommended variant, see ``capsule_id.inference.leave_out.left_out_predictions``
-    """
-
-    predictions: pd.DataFrame
-
-    @property
-    def line(self) -> str:
-        """The recommendation in words, with the lines of ``[model]``."""
-        row = self.table.loc[self.recommended]
-        said = (
-            f"{self.recommended}: the simplest variant within {STANDARD_ERRORS:g} standard errors of the best "
-            f"(elpd {row['difference']:.1f} ± {row['se']:.1f}). Write in [model]: {self._model}"
-        )
-        columns = self.table[["shape", "refits"]].itertuples()
-        unsure = [(str(name), refits) for name, shape, refits in columns if not shape <= LARGEST_SHAPE]
-        left, rough = ([name for name, refits in unsure if (refits == 0) == far] for far in (True, False))
-        if left:
-            said += f"\nFar behind, and therefore not fitted again without their settings: {', '.join(left)}."
-        if rough:
-            said += (
-                "\nThe elpd of these variants is uncertain, because few draws determine it (shape above "
-                f"{LARGEST_SHAPE:g}): {', '.join(rough)}. Measure more settings, or narrow the priors."
-            )
-        return said
-
-    @property
-    def text(self) -> str:
-        """Both tables, the recommendation, and how well the recommended variant predicts settings left out."""
-        tables = self.table.round(2).to_string(), self.predictions.round(2).to_string()
-        return "\n".join([tables[0], self.line, "", tables[1], predictions_text(self.predictions)])
+def _recommendation(name: str, model: ModelChoices, criterion: str) -> str:
+    """The recommended variant in words, with the lines of ``[model]``."""
+    free = ", ".join(f'"{symbol}"' for symbol in model.free)
+    lines = f'friction = "{model.friction}", reaction = "{model.reaction}", free = [{free}]'
+    return f"{name}: the simplest variant within {criterion}. Write in [model]: {lines}"
 
 
 @dataclass(frozen=True)
@@ -275,7 +225,7 @@ def compare_points(
     registry: Registry | None = None,
     seed: int = 0,
     progress: OnProgress | None = None,
-) -> PointChoice:
+) -> Choice:
     """Compare the variants of ``compare_models`` by their point fits alone, which takes a small part of the time.
 
     The log-evidence is that of a normal approximation at the best point (Laplace), with the scatters as independent of
@@ -302,12 +252,24 @@ def compare_points(
             "converged": not fit.stalled[np.argmax(fit.log_posterior)],
             "log_evidence": evidence,
         }
-    order = sorted(rows, key=lambda name: -rows[name]["log_evidence"])
-    for row in rows.values():
-        row["difference"] = row["log_evidence"] - rows[order[0]]["log_evidence"]
-    table = pd.DataFrame.from_dict({name: rows[name] for name in order}, orient="index").rename_axis("variant")
-    close = [name for name in order if rows[name]["difference"] >= -STRONG]
-    return PointChoice(table, min(close, key=lambda name: rows[name]["parameters"]), choices)
+    highest = max(row["log_evidence"] for row in rows.values())
+    table = _table(
+        {name: {**row, "difference": row["log_evidence"] - highest} for name, row in rows.items()}, "log_evidence"
+    )
+    behind = {str(name): float(rows[str(name)]["log_evidence"] - highest) for name in table.index}
+    close = [name for name, difference in behind.items() if difference >= -STRONG]
+    recommended = min(close, key=lambda name: rows[name]["parameters"])
+    said = _recommendation(
+        recommended, choices[recommended], f"{STRONG:g} of the best log-evidence ({behind[recommended]:.1f})"
+    )
+    rejected = [f"{name} ({value:.1f})" for name, value in behind.items() if value < -STRONG]
+    return Choice(table, recommended, f"{said}\nRejected: {', '.join(rejected)}." if rejected else said)
+
+
+def _table(rows: dict[str, dict[str, Any]], criterion: str) -> pd.DataFrame:
+    """Table of the variants, that with the highest ``criterion`` first."""
+    frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("variant")
+    return frame.sort_values(criterion, ascending=False, kind="stable")
 
 
 def _variants(rig: Rig, words: Sequence[str], registry: Registry | None) -> tuple[dict[str, ModelChoices], Registry]:
@@ -367,7 +329,7 @@ def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices],
     """The table, the best variant first, and the recommendation."""
     best = _best(fitted)
     rows: dict[str, dict[str, Any]] = {}
-    for name, one in sorted(fitted.items(), key=lambda item: -item[1].elpd):
+    for name, one in fitted.items():
         difference, error = _difference(one, best)
         rows[name] = {
             "parameters": one.parameters,
@@ -379,12 +341,20 @@ def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices],
             "shape": one.shape,
             "refits": one.refits,
         }
-    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("variant")
-    close = [name for name in table.index if fitted[name] is best or _close(table.loc[name])]
-    recommended = min(close, key=lambda name: (fitted[name].parameters, -fitted[name].elpd))
-    return Choice(table, recommended, dict(choices), fitted[recommended].predictions(seed))
-
-
-def _close(row: pd.Series) -> bool:
-    """Whether a variant predicts nearly as well as the best one."""
-    return bool(row["difference"] >= -STANDARD_ERRORS * row["se"])
+    close = [
+        name for name, row in rows.items() if fitted[name] is best or row["difference"] >= -STANDARD_ERRORS * row["se"]
+    ]
+    chosen = min(close, key=lambda name: (fitted[name].parameters, -fitted[name].elpd))
+    own, table = rows[chosen], _table(rows, "elpd")
+    standing = f"elpd {own['difference']:.1f} ± {own['se']:.1f}"
+    said = _recommendation(chosen, choices[chosen], f"{STANDARD_ERRORS:g} standard errors of the best ({standing})")
+    unsure = [name for name in map(str, table.index) if not fitted[name].shape <= LARGEST_SHAPE]
+    left, rough = ([name for name in unsure if (fitted[name].refits == 0) == far] for far in (True, False))
+    if left:
+        said += f"\nFar behind, and therefore not fitted again without their settings: {', '.join(left)}."
+    if rough:
+        said += (
+            "\nThe elpd of these variants is uncertain, because few draws determine it (shape above "
+            f"{LARGEST_SHAPE:g}): {', '.join(rough)}. Measure more settings, or narrow the priors."
+        )
+    return Choice(table, chosen, said, fitted[chosen].predictions(seed))

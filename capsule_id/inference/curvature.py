@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from capsule_id.errors import InputError
 from capsule_id.physics.batches import pool
-from capsule_id.views import counted
 
 # covariance: Covariance of the parameters at a minimum of least squares, from the singular values of the Jacobian.
 
@@ -27,12 +26,10 @@ class Covariance:
     ----------
     matrix : (d, d), units of the parameters; every entry is inf where the Jacobian is rank deficient
     rank : numerical rank of the Jacobian, its columns scaled to unit length; 0 where it is not finite
-    residual_sd : σ that scales the matrix, units of the residuals
     """
 
     matrix: np.ndarray
     rank: int
-    residual_sd: float
 
     @property
     def rank_deficient(self) -> bool:
@@ -45,41 +42,21 @@ class Covariance:
         return np.sqrt(np.diag(self.matrix))
 
 
-def covariance(jacobian: Jacobian, residuals: Residuals, residual_sd: float | None = None) -> Covariance:
-    """σ² (JᵀJ)⁻¹ from the singular values of J, infinite where J is rank deficient.
+def covariance(jacobian: Jacobian) -> Covariance:
+    """(JᵀJ)⁻¹ of standardised residuals from the singular values of J (n, d), infinite where J is rank deficient.
 
     A pseudo-inverse would give a direction without data zero variance.
 
     The columns are scaled to unit length first, so that the rank does not depend on the units of the parameters.
-
-    Parameters
-    ----------
-    jacobian : (n, d) of the residuals at the minimum
-    residuals : (n,) at the minimum
-    residual_sd : σ where it is known (1 for standardised residuals); None estimates it from the residuals
-
-    Raises
-    ------
-    InputError
-        If σ is None and there are not more residuals than parameters.
     """
-    count, parameters = jacobian.shape
-    if residual_sd is None:
-        if count <= parameters:
-            raise InputError(
-                "the residual sd can be estimated only from more residuals than parameters",
-                f"{counted(count, 'residual')} for {counted(parameters, 'parameter')}",
-                "give the sd of the measurements or more measurements",
-            )
-        residual_sd = float(np.sqrt(residuals @ residuals / (count - parameters)))
-    no_answer = np.full((parameters, parameters), np.inf)
-    if not all_finite(jacobian, residuals):
-        return Covariance(no_answer, 0, residual_sd)
+    no_answer = np.full((jacobian.shape[1], jacobian.shape[1]), np.inf)
+    if not np.isfinite(jacobian).all():
+        return Covariance(no_answer, 0)
     _, singular, right, column_norm = column_space(jacobian)
-    if len(singular) < parameters:
-        return Covariance(no_answer, len(singular), residual_sd)
-    root = residual_sd * right.T / singular / column_norm[:, None]
-    return Covariance(root @ root.T, parameters, residual_sd)
+    if len(singular) < jacobian.shape[1]:
+        return Covariance(no_answer, len(singular))
+    root = right.T / singular / column_norm[:, None]
+    return Covariance(root @ root.T, len(singular))
 
 
 def all_finite(jacobian: Jacobian, residuals: Residuals) -> bool:
@@ -123,11 +100,11 @@ BATCH = 32
 
 
 def in_batches(
-    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"]
+    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"], rows: int = BATCH
 ) -> Float[np.ndarray, "m ..."]:
-    """Evaluate ``function`` at points (m, d) in batches of exactly ``BATCH`` rows, on all cores; (m, ...)."""
-    padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % BATCH, axis=0)])
-    chunks = [padded[i : i + BATCH] for i in range(0, len(padded), BATCH)]
+    """Evaluate ``function`` at points (m, d) in batches of exactly ``rows`` rows, on all cores; (m, ...)."""
+    padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % rows, axis=0)])
+    chunks = [padded[i : i + rows] for i in range(0, len(padded), rows)]
     parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
     return np.concatenate(parts)[: len(points)]
 

@@ -4,11 +4,10 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import minimize
 
 from capsule_id.console import stop_if_interrupted, threads
 from capsule_id.errors import InputError
@@ -134,10 +133,6 @@ COST_RATIO_TO_ABANDON = 3.0
 TOGETHER = 2
 #: Try starts until two of them fit every channel within this many times its noise, or so many end at the same maximum.
 NOISE_RATIO_OF_A_GOOD_FIT, ENOUGH_THAT_AGREE = 1.2, 4
-#: Search range of a scatter's conditional maximum about its value, natural logarithm.
-SCATTER_SEARCH = 6.0
-#: Settings of the search over scatters that act together, natural logarithm.
-JOINT_SEARCH = {"xatol": 1e-3, "fatol": 1e-4, "maxiter": 2000}
 #: Factors by which a scatter moves together with what it multiplies.
 FACTORS = np.geomspace(0.1, 10.0, 32)
 
@@ -176,7 +171,7 @@ def joint_fit(
         raise _not_finite(target, ends[best].fit, len(starts))
     fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
-    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0).matrix
+    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0]).matrix
     scatters = np.flatnonzero(target.scatter)
     matrix[scatters, scatters] = _scatter_variances(target, u[best])
     return described(
@@ -241,7 +236,7 @@ def _compile_descent(target: LogPosterior) -> None:
     """Compile what ``_descend`` computes at a point."""
     u = dispersed_starts(target, 0, 1)
     if any(e.has_joint_scatters for e in target.experiments):
-        difference_descent.rows_of(target, u)
+        in_batches(partial(difference_descent.rows_of, target), u, difference_descent.ROWS)
     else:
         linearised(HeldResiduals(target, jnp.asarray(u[0])), u[0, target.located])
 
@@ -350,15 +345,14 @@ def _is_converged(fit: LeastSquaresFit) -> bool:
 
 def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
     """Conditional maximum, in u, of every scatter given the located entries of u (d,), by index."""
-    modes = {}
-    for i, terms in _scatter_terms(target, u).items():
-        bounds = (u[i] - SCATTER_SEARCH, u[i] + SCATTER_SEARCH)
-        found: Any = minimize_scalar(lambda t, terms=terms: -terms(t), bounds=bounds, options={"xatol": 1e-5})
-        modes[i] = float(found.x)
-    members, together = _joint_scatters(target, u)
-    if len(members):
-        at = minimize(lambda t: -together(t), u[members], method="Nelder-Mead", options=JOINT_SEARCH).x
-        modes |= dict(zip(members.tolist(), at.tolist(), strict=True))
+    groups = [(np.array([i]), lambda t, own=own: own(t[0])) for i, own in _scatter_terms(target, u).items()]
+    groups += [found for found in [_joint_scatters(target, u)] if len(found[0])]
+    modes: dict[int, float] = {}
+    for members, density in groups:
+        # The line search may try sizes that have no finite density.
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            found = minimize(lambda t, density=density: -density(t), u[members], method="BFGS").x
+        modes |= dict(zip(members.tolist(), found.tolist(), strict=True))
     return modes
 
 

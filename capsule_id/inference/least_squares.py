@@ -1,7 +1,7 @@
 """Nonlinear least squares from several starts, by derivatives or by differences."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -13,7 +13,13 @@ import numpy as np
 import optimistix as optx
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.inference.curvature import Covariance, Jacobian, Residuals, all_finite, column_space, covariance
+from capsule_id.inference.curvature import (
+    Jacobian,
+    Residuals,
+    all_finite,
+    column_space,
+    in_batches,
+)
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.batches import pool
 from capsule_id.precision import COMPILE, COMPILE_QUICKLY, require_float64
@@ -40,10 +46,6 @@ class HasJacobian(Protocol):
         ...
 
 
-FIRST_DAMPING = 1e-6
-"""Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
-strongly correlated. Heavy damping would stop a start near the minimum as if it had converged."""
-
 SMALLEST_EFFECT = 0.01
 """Dimensionless. Smallest effect of a parameter on the residuals, relative to the strongest parameter, when it changes
 by 100 % of its start. Below it the scale is the step with this effect: a start at zero defines no scale."""
@@ -63,8 +65,6 @@ class LeastSquaresFit:
     cost : (s,) ½ Σ r², units of the residuals squared
     stalled : (s,) bool, no convergence: too many steps, non-finite values, or vanishing steps away from a stationary
         point
-    steps : (s,) solver steps, rejected ones included
-    message : (s,) the reason, "" where it converged
     residuals : (s, n) at the end points
     jacobian : (s, n, d) of the residuals at the end points
     """
@@ -72,21 +72,8 @@ class LeastSquaresFit:
     x: np.ndarray
     cost: np.ndarray
     stalled: np.ndarray
-    steps: np.ndarray
-    message: tuple[str, ...]
     residuals: np.ndarray
     jacobian: np.ndarray
-
-    @property
-    def best(self) -> int:
-        """Index of the start with the smallest finite cost among those that converged, or among all if none did."""
-        candidates = self.stalled if self.stalled.all() else ~self.stalled
-        return int(np.argmin(np.where(candidates & np.isfinite(self.cost), self.cost, np.inf)))
-
-    def covariance(self, residual_sd: float | None = None, start: int | None = None) -> Covariance:
-        """Covariance at the end point of ``start`` (default: the best one); see the function ``covariance``."""
-        index = self.best if start is None else start
-        return covariance(self.jacobian[index], self.residuals[index], residual_sd)
 
 
 @dataclass(frozen=True)
@@ -99,11 +86,14 @@ class Solver:
         tolerance (1 + its size)
     max_steps : solver steps, rejected ones included, after which a start counts as stalled
     heavy : residuals take milliseconds, so the code is optimised and parameters are scaled by effect (Marquardt 1963)
+    damping : of the first step beside the squared column norms of heavy residuals, dimensionless. Their parameters are
+        strongly correlated: heavy damping would stop a start near the minimum as if it had converged
     """
 
     tolerance: float = 1e-9
     max_steps: int = 1024
     heavy: bool = False
+    damping: float = 1e-6
 
 
 #: Default solver settings.
@@ -138,34 +128,35 @@ def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVE
     descend = partial(_descend, partial(_linearised, residual, solver.heavy), solver=solver)
     # The first start compiles the programs that all threads then call.
     ends = [descend(starts[0]), *pool().map(descend, starts[1:])]
-    x, residuals, jacobian, steps, message = zip(*ends, strict=True)
-    return LeastSquaresFit(
-        x=np.stack(x),
-        cost=0.5 * np.sum(np.stack(residuals) ** 2, axis=1),
-        stalled=np.array([reason != "" for reason in message]),
-        steps=np.array(steps),
-        message=message,
-        residuals=np.stack(residuals),
-        jacobian=np.stack(jacobian),
-    )
+    return _fit_of(ends)
 
 
 class _End(NamedTuple):
-    """Where one start ended: x (d,), residuals (n,) and Jacobian (n, d) there, steps, reason for no convergence."""
+    """Where one start ended: x (d,), residuals (n,) and Jacobian (n, d) there, and whether it is no minimum."""
 
     x: np.ndarray
     residuals: np.ndarray
     jacobian: np.ndarray
-    steps: int
-    message: str
+    stalled: bool
+
+
+def _fit_of(ends: "Sequence[_End]") -> LeastSquaresFit:
+    x, residuals, jacobian, stalled = zip(*ends, strict=True)
+    return LeastSquaresFit(
+        x=np.stack(x),
+        cost=0.5 * np.sum(np.stack(residuals) ** 2, axis=1),
+        stalled=np.array(stalled),
+        residuals=np.stack(residuals),
+        jacobian=np.stack(jacobian),
+    )
 
 
 def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
     """Levenberg-Marquardt from one start (d,)."""
     residuals, jacobian = linearise(start)
     if not all_finite(jacobian, residuals):
-        return _End(start, residuals, jacobian, 1, "The residuals or their Jacobian are not finite: try another start.")
-    scale, unit = (_effects if solver.heavy else _scales)(jacobian, start)
+        return _End(start, residuals, jacobian, True)
+    scale, unit = _effects(jacobian, solver.damping) if solver.heavy else _scales(jacobian, start)
     method = optx.LevenbergMarquardt(rtol=solver.tolerance, atol=solver.tolerance, linear_solver=lx.QR())
     known, v = _Known(residuals / unit, jacobian * scale / unit), jnp.asarray(start / scale)
     state, steps, converged = _FIRST(method, known, v), 0, False
@@ -184,12 +175,9 @@ def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
             known = _Known(np.full_like(at_trial, np.inf), np.zeros_like(slopes))
     x = np.asarray(v) * scale
     residuals, jacobian = linearise(x)
-    if not converged and steps == solver.max_steps:
-        return _End(x, residuals, jacobian, steps, "The maximum number of steps was reached: try another start.")
     # The solver tests step sizes only, and heavy damping makes steps small far from a minimum.
-    stationary = _stationary(jacobian, residuals, solver.tolerance * unit)
-    reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
-    return _End(x, residuals, jacobian, steps, "" if stationary else reason)
+    short = not converged and steps == solver.max_steps
+    return _End(x, residuals, jacobian, short or not _stationary(jacobian, residuals, solver.tolerance * unit))
 
 
 class _Known(eqx.Module):
@@ -273,13 +261,13 @@ _PROGRAMS: dict[bool, Callable[..., Any]] = {
 }
 
 
-def _effects(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
+def _effects(jacobian: Jacobian, damping: float) -> tuple[np.ndarray, float]:
     """Scale as ``_scales`` does, but give every column of the Jacobian the same norm, the unit of the residuals."""
     column_norm = np.linalg.norm(jacobian, axis=0)
     unit = float(np.max(column_norm)) or 1.0
-    scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), np.ones_like(start))
+    scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), 1.0)
     # The solver's initial damping is 1. Larger residual units reduce its effect by their square.
-    return scale, float(np.sqrt(FIRST_DAMPING)) * unit
+    return scale, float(np.sqrt(damping)) * unit
 
 
 def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
@@ -295,75 +283,35 @@ def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     return scale, unit if unit > 0 else 1.0
 
 
-# difference descent: Levenberg-Marquardt by differences, for models whose residuals have kinks in the parameters.
+# difference descent: Derivatives by differences, for models whose residuals have kinks in the parameters.
 #
 # Derivatives at a point say little about a motion that sticks a step later on its other side. Differences over a finite
-# step smooth the kinks, and the log-posterior of many damped steps is computed in one batch.
+# step smooth the kinks, and a batch computes the residuals of all of them.
 
 
 #: Rows of a batch of residuals.
 ROWS = 8
 #: Step of the differences: relative, or part of the prior's sd where u is not a logarithm.
 DIFFERENCE = 2e-3
-#: Dampings that one batch tries, relative to the diagonal of J'J.
-DAMPINGS = np.geomspace(1e-5, 1e3, 16)
-#: Largest change of a logarithm in one step, and of another parameter in prior sds.
-LONGEST_STEP = 0.7
-#: A step that lowers the cost by less than this part of it is the last one; largest number of steps.
-LEAST_DECREASE, MAX_STEPS = 3e-3, 10
+#: Solver settings. Where derivatives change within a step, a light first damping leads to a wrong maximum.
+KINKED = Solver(tolerance=3e-3, max_steps=20, heavy=True, damping=1e-3)
 
 
-def descend(target: LogPosterior, u: np.ndarray, most: int = MAX_STEPS) -> LeastSquaresFit:
+def descend(target: LogPosterior, u: np.ndarray, most: int = KINKED.max_steps) -> LeastSquaresFit:
     """Minimise half the squared residuals over the located parameters from u (d,) in ``most`` steps; the scatters stay."""
     located = target.located
-    scale = np.where(target.positive, 1.0, target.prior_sd)[located]
-    step, u = DIFFERENCE * scale, u.copy()
-    steps = 0
-    while steps < most:
-        steps += 1
-        stop_if_interrupted()
+    step = DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd)[located]
+
+    def differences(x: np.ndarray) -> tuple[Residuals, Jacobian]:
         points = np.repeat(u[None], len(located) + 1, axis=0)
-        points[1:, located] += np.diag(step)
-        residuals = rows_of(target, points)
-        jacobian = (residuals[1:] - residuals[0]).T / step
-        cost = 0.5 * float(residuals[0] @ residuals[0])
-        if not (np.isfinite(jacobian).all() and np.isfinite(cost)):
-            break
-        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residuals[0]
-        damped = normal + DAMPINGS[:, None, None] * np.diag(np.diag(normal))
-        moves = -np.linalg.solve(damped, np.broadcast_to(gradient, (len(damped), len(step)))[..., None])[..., 0]
-        moves /= np.maximum(1.0, np.max(np.abs(moves / scale), axis=1, keepdims=True) / LONGEST_STEP)
-        trials = np.repeat(u[None], len(moves), axis=0)
-        trials[:, located] += moves
-        costs = 0.5 * np.sum(rows_of(target, trials) ** 2, axis=1)
-        best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-        if costs[best] < cost:
-            u = trials[best]
-        if not costs[best] < (1.0 - LEAST_DECREASE) * cost:
-            break
-    return LeastSquaresFit(
-        x=u[located][None],
-        cost=np.array([cost]),
-        stalled=np.array([not np.isfinite(cost)]),
-        steps=np.array([steps]),
-        message=("",),
-        residuals=residuals[:1],
-        jacobian=jacobian[None],
-    )
+        points[:, located] = np.concatenate([x[None], x + np.diag(step)])
+        residuals = in_batches(partial(rows_of, target), points, ROWS)
+        return residuals[0], (residuals[1:] - residuals[0]).T / step
 
-
-def rows_of(target: LogPosterior, u: np.ndarray) -> np.ndarray:
-    """(m, n) residuals at u (m, d)."""
-    padded = np.concatenate([u, np.repeat(u[-1:], -len(u) % ROWS, axis=0)])
-    first, *rest = np.split(padded, len(padded) // ROWS)
-    # The first batch compiles the program that all threads then call.
-    parts = [
-        np.asarray(_residuals(target, first)),
-        *pool().map(lambda part: np.asarray(_residuals(target, part)), rest),
-    ]
-    return np.concatenate(parts)[: len(u)]
+    return _fit_of([_descend(differences, u[located], replace(KINKED, max_steps=most))])
 
 
 @partial(jax.jit, compiler_options=COMPILE)
-def _residuals(target: LogPosterior, u: jax.Array) -> jax.Array:
+def rows_of(target: LogPosterior, u: jax.Array) -> jax.Array:
+    """(m, n) residuals at u (m, d)."""
     return jax.vmap(target.residuals)(u)

@@ -51,7 +51,7 @@ def variance_shares(
     -------
     By parameter, then by input: the label of a table, ``prior of c``, ``stated value of m1``.
     """
-    found = covariance(jacobian, np.zeros(len(jacobian)), residual_sd=1.0)
+    found = covariance(jacobian)
     if found.rank_deficient:
         return {}
     effect = (jacobian @ found.matrix) ** 2 / np.diag(found.matrix)
@@ -245,7 +245,7 @@ def described(
     The error of a parameter sampled through its logarithm is its relative error times its value; NaN for scatters.
     """
     theta, located, errors = target.theta(u), target.located, np.full(target.dimension, np.nan)
-    matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
+    matrix = covariance(at_fit)
     errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
     return PointFit(
         names=target.names,

@@ -47,14 +47,6 @@ class _Fit:
     target: LogPosterior
     fit: PointFit
 
-    @classmethod
-    def of(
-        cls, other: LogPosterior, experiments: Sequence[Experiment], known: Mapping[str, float], seed: int
-    ) -> "_Fit":
-        """Fit other models of the same readings, from many starts about values by name."""
-        target = LogPosterior(other.rig, experiments)
-        return cls(target, joint_fit(target, known, seed))
-
     def with_law(self, law: FrictionModel, seed: int) -> "_Fit":
         """Fit another friction law from this fit alone: the motion is known, and only a comparison needs the result."""
         experiments = [e.with_friction(law) if isinstance(e, SurfaceExperiment) else e for e in self.target.experiments]
@@ -119,12 +111,13 @@ def fit_coloured(target: LogPosterior, first: PointFit, seed: int) -> tuple[LogP
         return target, first, []
     experiments = [e if new is None else new[0] for e, new in zip(target.experiments, changed, strict=True)]
     starts = {name: value for new in changed if new is not None for name, value in new[1].items()}
-    coloured = _Fit.of(target, experiments, {**values, **starts}, seed)
+    other = LogPosterior(target.rig, experiments)
+    coloured = _Fit(other, joint_fit(other, {**values, **starts}, seed))
     if coloured.height < white.height:
         return target, first, []
     rows = [white.row("first, white noise"), coloured.row("quoted, AR(1) noise")]
     records = list(dict.fromkeys(e.shares_noise for e, new in zip(target.experiments, changed, strict=True) if new))
-    finding = Finding("runs.second_fit", "warn", {"records": records, "fits": rows}, records[0])
+    finding = Finding("runs.second_fit", "warn", {"records": records, "alternatives": rows}, records[0])
     return coloured.target, coloured.fit, [finding]
 
 
@@ -154,7 +147,7 @@ def compare_laws(target: LogPosterior, fit: PointFit, seed: int) -> list[Finding
         "better": own not in close,
         "gain": behind[own][0] - behind[chosen][0],
         "moved": [(name, quoted.values[name], new[name]) for name in quoted.physical if name in new],
-        "laws": [
+        "alternatives": [
             {**fits[law].row(law.name), "behind the best": f"{difference:.0f} ± {error:.0f}"}
             for law, (difference, error) in sorted(behind.items(), key=lambda item: item[1][0])
         ],

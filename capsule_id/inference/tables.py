@@ -131,9 +131,9 @@ def check_engine(sampled: SampledFit) -> list[Finding]:
 
 
 def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> list[ResultTable]:
-    """Return all tables; those that compare bench tests and runs only where there are runs.
+    """Return all tables; a finding whose facts hold rows of ``alternatives``, models of the same readings, has one too.
 
-    They need derivatives, which say little where residuals have kinks: then they are left out.
+    Tables that compare bench tests and runs need runs, and derivatives, which say little where residuals have kinks.
 
     Parameters
     ----------
@@ -144,11 +144,16 @@ def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> l
         [table for maker in declared(sampled.experiments, "tables", bench) for table in maker(sampled)]
         for bench in (False, True)
     )
+    compared = [
+        ResultTable(found.code, pd.DataFrame(rows).set_index(next(iter(rows[0]))), found.facts)
+        for found in sampled.findings
+        if (rows := found.facts.get("alternatives"))
+    ]
     kinked = any(e.has_joint_scatters for e in sampled.experiments)
     if any(not e.bench for e in sampled.experiments) and not kinked:
         gained = precision_gained(target, fit, sampled.posterior, sampled.bench)
         of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
-    tables = [*of_runs, *of_bench, *([] if kinked else share_table(target, fit)), prior_table(target)]
+    tables = [*of_runs, *of_bench, *compared, *([] if kinked else share_table(target, fit)), prior_table(target)]
     return [*tables, predictive_table(sampled, predictive)] if sampled.draws else tables
 
 
@@ -270,7 +275,7 @@ def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, fl
         density += np.log(np.cosh(x)) + np.mean(0.5 * np.log(variance), axis=1) * np.sum(hat[rows])
         weight = np.exp(density - np.max(density))
         jacobian[rows] *= (misfit.at(own[symbol], np).sd / np.sqrt(weight @ variance / np.sum(weight)))[:, None]
-    matrix = covariance(jacobian, np.zeros(len(jacobian)), residual_sd=1.0)
+    matrix = covariance(jacobian)
     errors = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
     return {**fit.standard_errors, **{target.names[i]: float(sd) for i, sd in zip(located, errors, strict=True)}}
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import polynomial
 from scipy import ndimage, signal
-from scipy.optimize import minimize
+from scipy.optimize import least_squares
 
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.tones import noise_level
@@ -27,9 +27,8 @@ USUAL_STEP = 0.2
 #: Most decimal places, and most significant digits, of rounded times. Samples that are looked at: they show as much as a
 #: longer record does.
 MOST_DIGITS, SAMPLES = 9, 4096
-#: Step of a frequency, periods over the record, and steps about an alias; options of the search for the least misfit, and
-#: number of the aliases that it refines.
-PHASE, NEAR, REFINEMENT, REFINED = 0.05, range(-5, 6), {"maxiter": 100}, 3
+#: Step of a frequency, periods over the record, and steps about an alias; number of the aliases that are refined.
+PHASE, NEAR, REFINED = 0.05, range(-5, 6), 3
 
 
 def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: float = 0.0) -> np.ndarray:
@@ -49,25 +48,23 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: flo
     if even:
         return np.unique(np.abs(np.concatenate([multiples - frequency, multiples + frequency])))
 
-    def misfit(f: float, damping: float) -> float:
-        """Sum of squares beside a tone of this frequency, Hz, with this damping rate, 1/s."""
+    def rest(f: float, damping: float) -> np.ndarray:
+        """(n,) residuals beside a tone of this frequency, Hz, with this damping rate, 1/s."""
         angle, decay = 2.0 * np.pi * f * elapsed, np.exp(-damping * elapsed)
         design = np.stack([decay * np.cos(angle), decay * np.sin(angle), np.ones_like(angle)], axis=1)
-        rest = values - design @ np.linalg.lstsq(design, values)[0]
-        return float(rest @ rest)
+        return values - design @ np.linalg.lstsq(design, values)[0]
+
+    def misfit(f: float, damping: float) -> float:
+        return float(np.sum(rest(f, damping) ** 2))
 
     def best(f: float, damping: float) -> tuple[float, float, float]:
         """Least misfit about a frequency and a damping rate, and both there."""
-        found = minimize(
-            lambda x: misfit(f + x[0] * step, damping * float(np.exp(x[1]))),
-            np.zeros(2),
-            method="Nelder-Mead",
-            options=REFINEMENT,
-        )
-        return float(found.fun), f + found.x[0] * step, damping * float(np.exp(found.x[1]))
+        found = least_squares(lambda x: rest(f + x[0] * step, damping * np.exp(x[1])) / size, np.zeros(2)).x
+        f, damping = f + float(found[0]) * step, damping * float(np.exp(found[1]))
+        return misfit(f, damping), f, damping
 
     # The best of the steps leaves a misfit that hides what another frequency does not explain.
-    step = PHASE / elapsed[-1]
+    step, size = PHASE / elapsed[-1], float(np.std(values)) or 1.0
     least, frequency, damping = best(frequency, min(RATES * frequency, key=lambda rate: misfit(frequency, rate)))
     candidates = np.unique(np.abs(np.concatenate([multiples - frequency, multiples + frequency])))
     # The jitter of the times leaves an error of the sampling rate.

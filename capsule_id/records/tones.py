@@ -3,13 +3,12 @@
 import contextlib
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Num
 from scipy import stats
 from scipy.interpolate import CubicSpline
-from scipy.optimize import minimize_scalar
+from scipy.optimize import least_squares
 from scipy.signal import correlate
 
 from capsule_id.errors import InputError
@@ -106,6 +105,8 @@ FEWEST_SAMPLES = 8  # for five unknowns, including the noise level
 LEAST_POWER, PROMINENT = 1e-3, 100.0
 _SEARCH_HALF_WIDTH = 1.5  # about a first guess, in 1 / duration: a spectral peak is 1 wide
 _SEARCH_POINTS = 25
+#: Relative tolerance of the sum of squares and of the frequency.
+TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -213,14 +214,18 @@ def _tone_design(time: Record, Omega: float) -> np.ndarray:
     return np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones_like(time)], axis=1)
 
 
-def _sum_of_squares(time: Record, values: Record, Omega: float) -> float:
-    """Sum of squared residuals of the best tone of this frequency."""
+def _residuals(time: Record, values: Record, Omega: float) -> np.ndarray:
+    """Residuals (n,) of the best tone of this frequency."""
     design = _tone_design(time, Omega)
     try:
         unknowns = np.linalg.solve(design.T @ design, design.T @ values)
     except np.linalg.LinAlgError:  # much less than a period: the cosine is constant
         unknowns = np.linalg.lstsq(design, values)[0]
-    return float(np.sum((values - design @ unknowns) ** 2))
+    return values - design @ unknowns
+
+
+def _sum_of_squares(time: Record, values: Record, Omega: float) -> float:
+    return float(np.sum(_residuals(time, values, Omega) ** 2))
 
 
 def _significant_reduction(samples: int) -> float:
@@ -241,13 +246,16 @@ def _refine(time: Record, values: Record, guess: float) -> tuple[float, float]:
     best = int(np.argmin([_sum_of_squares(time, values, Omega) for Omega in grid]))
     step = grid[1] - grid[0]
     bounds = (max(grid[best] - step, 0.5 * grid[0]), grid[best] + step)
-    found: Any = minimize_scalar(
-        lambda Omega: _sum_of_squares(time, values, Omega),
+    unit = float(np.std(values)) or 1.0
+    found = least_squares(
+        lambda own: _residuals(time, values, own[0]) / unit,
+        grid[best : best + 1],
         bounds=bounds,
-        method="bounded",
-        options={"xatol": 1e-9 * guess},
-    )
-    return float(found.x), float(found.fun)
+        x_scale=step,
+        ftol=TOLERANCE,
+        xtol=TOLERANCE,
+    ).x[0]
+    return float(found), _sum_of_squares(time, values, found)
 
 
 def _harmonic_at(time: Record, values: Record, Omega: float, stated: float) -> Harmonic:

@@ -143,7 +143,7 @@ def test_a_second_fit_is_quoted_where_it_explains_more(tmp_path: Path, monkeypat
         assert len(second_of(tuple(findings))) == quoted
         assert (second is first) == (not quoted)
         if quoted:
-            white, coloured = findings[0].facts["fits"]
+            white, coloured = findings[0].facts["alternatives"]
             assert (white["residuals white"], coloured["residuals white"]) == ("no", "yes")
             assert coloured["log-posterior"] > white["log-posterior"] + 100.0
             assert "k1 = 400 ±" in coloured["parameters"]
@@ -159,7 +159,7 @@ def test_the_law_that_explains_the_runs_is_named(tmp_path: Path, monkeypatch: py
         found[ratio] = second_fits.compare_laws(target, at_truth(target, {}, 0), 0)
     (law,) = found[0.8]
     assert (law.level, law.facts["law"], law.facts["line"]) == ("warn", "eq. (1), free ratio", 'free = ["ratio"]')
-    assert next(row["fit"] for row in law.facts["laws"]) == "eq. (1), free ratio"
+    assert next(row["fit"] for row in law.facts["alternatives"]) == "eq. (1), free ratio"
     # negative control: eq. (1) is right
     assert found[0.5] == []
 

@@ -93,6 +93,10 @@ def test_what_the_record_holds_is_found(disturbance: np.ndarray, extra: dict[str
     assert ("The zero drifts by" in MESSAGES["decays.second_fit"].text("warn", finding.facts)) == (
         expected.drift != "none"
     )
+    stated, quoted = finding.facts["alternatives"]
+    assert (stated["model"], quoted["model"]) == (finding.facts["first"], finding.facts["second"])
+    assert stated["BIC"] > quoted["BIC"] == 0.0
+    assert (stated["residuals white"], quoted["residuals white"]) == ("no", "yes")
 
 
 @pytest.mark.full

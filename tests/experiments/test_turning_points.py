@@ -195,10 +195,9 @@ def test_a_force_that_is_missing_is_added_or_named(tmp_path: Path, extra: dict[s
     assert (named.code, second.model) == ("decays.second_fit", mended.model)
     assert line in finding_text(named, messages_of(default_registry()))
     assert [one.level for one in checked(mended)[:2]] == ["ok", "ok"]
-    (table,) = [each for make in second.tables for each in make([second], cast(Any, None))]
-    assert table.frame.index.tolist() == ["stated", "quoted"]
-    assert table.frame["BIC"]["stated"] > 10.0 > table.frame["BIC"]["quoted"] == 0.0
-    assert [each for make in own.tables for each in make([own], cast(Any, None))] == []
+    stated, quoted = named.facts["alternatives"]
+    assert (stated["fit"], quoted["fit"]) == ("stated", "quoted")
+    assert stated["BIC"] > 10.0 > quoted["BIC"] == 0.0
     truth, own_fit = FORCES | extra, screened(second, second.model)
     for symbol in ("k1", "c", *extra):
         assert abs(own_fit.values[symbol] - truth[symbol]) < 4.0 * own_fit.errors[symbol]

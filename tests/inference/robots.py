@@ -10,7 +10,7 @@ import numpy as np
 import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign
-from capsule_id.inference.compare import PointChoice, compare_points
+from capsule_id.inference.compare import Choice, compare_points
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling import DEFAULT_BUDGET
 from tests.inference.calibration import Outcome, normal_score
@@ -67,7 +67,7 @@ def study(
         yield Outcome(z, tuple((f.code, f.experiment) for f in result.findings if f.level == "fail"))
 
 
-def found_by_points(folder: Path, law: str, seed: int, periods: np.ndarray) -> tuple[PointChoice, dict[str, float]]:
+def found_by_points(folder: Path, law: str, seed: int, periods: np.ndarray) -> tuple[Choice, dict[str, float]]:
     """Comparison of the variants of a wrong law by point fits, on a random robot, and its true values."""
     rng = np.random.default_rng([seed, 0])
     design, values = random_robot(rng, periods)

@@ -176,18 +176,6 @@ def _stacked(draws: Sequence[ValuesBySymbol]) -> dict[str, np.ndarray]:
     return {name: np.array([draw[name] for draw in draws]) for name in draws[0]}
 
 
-def second_fit_table(runs: Sequence[CapsuleRun], fit: Fitted) -> list[ResultTable]:
-    """Tables of the second fits of runs: coloured noise, and other friction laws; [] without one."""
-    del runs
-    found = {finding.code: finding.facts for finding in fit.findings}
-    tables = {"runs.second_fit": "fits", "runs.laws": "laws"}
-    return [
-        ResultTable(code, pd.DataFrame(found[code][rows]).set_index("fit"))
-        for code, rows in tables.items()
-        if code in found
-    ]
-
-
 # panels: Plot data of a forced run: every channel with its residuals, and the phase portrait.
 
 

@@ -18,7 +18,6 @@ from capsule_id.experiments.forced_run.checks import (
     predicted_motion,
     run_comparisons,
     scaled_groups,
-    second_fit_table,
 )
 from capsule_id.experiments.forced_run.experiment import CapsuleRun, before_samples
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
@@ -43,7 +42,7 @@ class OtherRun(CapsuleRun):
     """A run with any drive: the checks, tables and panels that need no harmonic force."""
 
     checks = (check_predictable, check_repeated)
-    tables = (second_fit_table, predicted_motion)
+    tables = (predicted_motion,)
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return self.comparisons(theta, draws)[0]

@@ -1,24 +1,22 @@
 """Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from capsule_id.experiments.base import Start
-from capsule_id.experiments.checks import LEVEL, ljung_box, refit
-from capsule_id.experiments.context import Fitted, TableMaker
+from capsule_id.experiments.checks import refit
+from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.checks import CHECKS, later_start, stiffness_by_record
 from capsule_id.experiments.free_vibration.hidden_terms import check_hidden_terms
-from capsule_id.experiments.free_vibration.readings import DecayModel
-from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, Screened
-from capsule_id.experiments.free_vibration.second_fit import Screening, decay_starts, nested_starts, second_models
+from capsule_id.experiments.free_vibration.record import DecayRecord
+from capsule_id.experiments.free_vibration.second_fit import decay_starts, nested_starts, second_models
 from capsule_id.records.tones import other_tone
 from capsule_id.views import Facts, Finding, ResultTable
 
-# tables: Views of free decays: estimates by record, and comparison of the stated with the quoted model.
+# tables: Views of free decays: estimates by record, and correlations of the damping.
 
 
 def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
@@ -54,59 +52,11 @@ def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Resul
     return [ResultTable("decays.damping", frame)]
 
 
-def second_fit_table(screened: Callable[[Any, DecayModel], Screened]) -> TableMaker:
-    """Return the table of the decays alone under the stated model and under the quoted one; [] where both are the same.
-
-    ``screened`` fits a decay alone under a model.
-    """
-
-    def table(decays: Sequence[Decay], fit: Fitted) -> list[ResultTable]:
-        del fit
-        replaced = [(e, e.about.screened) for e in decays if e.about.screened is not None]
-        if not replaced:
-            return []
-        # Both fits use the same samples, so that their BIC can be compared.
-        models = [replace(DecayModel.stated(e.table.settings), thin=e.model.thin) for e, _ in replaced]
-        stated = [screened(e, model) for (e, _), model in zip(replaced, models, strict=True)]
-        rows = []
-        for role, model, fits in (
-            ("stated", models[0], stated),
-            ("quoted", replaced[0][0].model, [quoted for _, quoted in replaced]),
-        ):
-            means = {symbol: _weighted_mean(fits, symbol) for symbol in ("k1", "c", *model.symbols)}
-            row = {
-                "fit": role,
-                "model": model.name,
-                "parameters": ", ".join(f"{name} = {mean:.5g} ± {sd:.2g}" for name, (mean, sd) in means.items()),
-                "noise, SI": float(np.mean([one.noise for one in fits])),
-                "BIC": sum(one.bic for one in fits),
-            }
-            if decays[0].time_series:
-                white = all(ljung_box(one.residuals)[1] * len(decays) >= LEVEL for one in fits)
-                row["residuals white"] = "yes" if white else "no"
-            rows.append(row)
-        frame = pd.DataFrame(rows).set_index("fit")
-        frame["BIC"] -= frame["BIC"].min()
-        return [ResultTable("decays.second_fit", frame, {"lines": replaced[0][0].lines})]
-
-    return table
-
-
-def _weighted_mean(fits: Sequence[Screened], symbol: str) -> tuple[float, float]:
-    """Mean of the estimates of every record, weighted by their standard errors, and its standard error."""
-    weight = np.array([one.errors[symbol] for one in fits]) ** -2.0
-    return float(np.average([one.values[symbol] for one in fits], weights=weight)), float(np.sum(weight) ** -0.5)
-
-
 class FreeVibration(DecayRecord):
     """One channel of one raw record, with its checks, tables and starts."""
 
     checks = (*CHECKS, check_hidden_terms)
-    tables = (
-        decay_table,
-        damping_table,
-        second_fit_table(lambda e, model: Screening(e, model.thin).fit(model)[0]),
-    )
+    tables = (decay_table, damping_table)
 
     @classmethod
     def second_models(

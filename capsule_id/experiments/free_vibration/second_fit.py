@@ -595,7 +595,10 @@ class Demanded(NamedTuple):
 
 
 def replaced(
-    decays: Sequence[Any], judged: Iterable[int], demanded: Callable[[list[Any]], Demanded]
+    decays: Sequence[Any],
+    judged: Iterable[int],
+    demanded: Callable[[list[Any]], Demanded],
+    screened: Callable[[Any, DecayModel], Screened],
 ) -> tuple[list[Any], list[Finding]]:
     """Return ``decays`` under the models that they demand, and findings that name these models.
 
@@ -605,6 +608,7 @@ def replaced(
     ----------
     judged : indices of the decays that may have another model
     demanded : what the decays of one group demand
+    screened : fit of a decay alone under a model
     """
     chosen, findings = list(decays), list[Finding]()
     groups: dict[Any, list[int]] = {}
@@ -617,10 +621,39 @@ def replaced(
         first, second = decays[members[0]].model, others[0].model
         if labels and second != first:
             facts = {"labels": labels, "first": first.name, "second": second.name, "drift": "", **facts}
+            facts["alternatives"] = _both_fits(others, screened)
             findings.append(Finding("decays.second_fit", "warn", {"lines": others[0].lines, **facts}, labels[0]))
             for i, other in zip(members, others, strict=True):
                 chosen[i] = other
     return chosen, findings
+
+
+def _both_fits(decays: Sequence[Any], screened: Callable[[Any, DecayModel], Screened]) -> list[dict[str, object]]:
+    """Rows of a table of the decays alone under the stated model and under the quoted one, on the same readings."""
+    quoted = decays[0].model
+    stated = replace(DecayModel.stated(decays[0].table.settings), thin=quoted.thin)
+    pairs = ((stated, [screened(e, stated) for e in decays]), (quoted, [e.about.screened for e in decays]))
+    rows = []
+    for role, (model, fits) in zip(("stated", "quoted"), pairs, strict=True):
+        means = {symbol: _weighted_mean(fits, symbol) for symbol in ("k1", "c", *model.symbols)}
+        row = {
+            "fit": role,
+            "model": model.name,
+            "parameters": ", ".join(f"{name} = {mean:.5g} ± {sd:.2g}" for name, (mean, sd) in means.items()),
+            "noise, SI": float(np.mean([one.noise for one in fits])),
+            "BIC": sum(one.bic for one in fits) - min(sum(one.bic for one in each) for _, each in pairs),
+        }
+        if decays[0].time_series:
+            white = all(ljung_box(one.residuals)[1] * len(decays) >= LEVEL for one in fits)
+            row["residuals white"] = "yes" if white else "no"
+        rows.append(row)
+    return rows
+
+
+def _weighted_mean(fits: Sequence[Screened], symbol: str) -> tuple[float, float]:
+    """Mean of the estimates of every record, weighted by their standard errors, and its standard error."""
+    weight = np.array([one.errors[symbol] for one in fits]) ** -2.0
+    return float(np.average([one.values[symbol] for one in fits], weights=weight)), float(np.sum(weight) ** -0.5)
 
 
 def second_models(
@@ -640,7 +673,8 @@ def second_models(
             kept[i] = record.with_model(replace(record.model, thin=thin))
             findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "thin": thin}, record.label))
     judged = (i for i, record in enumerate(records) if record.label not in no_decay)
-    chosen, named = replaced(kept, judged, partial(_demanded, level=LEVEL / len(records)))
+    demanded = partial(_demanded, level=LEVEL / len(records))
+    chosen, named = replaced(kept, judged, demanded, lambda e, model: Screening(e, model.thin).fit(model)[0])
     return chosen, findings + named
 
 

@@ -15,7 +15,6 @@ from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters,
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.checks import each, halves
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
-from capsule_id.experiments.free_vibration.experiment import second_fit_table
 from capsule_id.experiments.free_vibration.hidden_terms import (
     check_hidden_terms,
     further_sensitivities,
@@ -316,7 +315,6 @@ class TurningPoints(Decay):
 
     title = "turning points of a free decay"
     checks = (check_steps, check_forces, check_halves, check_hidden_terms)
-    tables = (second_fit_table(screened),)
 
     def __init__(
         self,
@@ -372,7 +370,7 @@ class TurningPoints(Decay):
         cls, records: "Sequence[Any]", readings: Sequence[Finding] = ()
     ) -> tuple[list[Any], list[Finding]]:
         del readings
-        return replaced(records, range(len(records)), demanded)
+        return replaced(records, range(len(records)), demanded, screened)
 
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
         del xp

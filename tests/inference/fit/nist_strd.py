@@ -6,12 +6,15 @@ standard deviations and residual sum of squares (11 digits, computed by NIST in 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from capsule_id.inference.curvature import Covariance, covariance
+from capsule_id.inference.least_squares import LeastSquaresFit
 
 Model = Callable[[jax.Array, np.ndarray], jax.Array]
 
@@ -209,3 +212,22 @@ PROBLEMS: tuple[StrdProblem, ...] = (
         5147 105, 4427 110, 3820 115, 3307 120, 2872 125""",
     ),
 )
+
+
+def best_of(fit: LeastSquaresFit) -> int:
+    """Index of the start with the smallest cost among those that converged."""
+    return int(np.argmin(np.where(fit.stalled, np.inf, fit.cost)))
+
+
+def residual_sd_of(fit: LeastSquaresFit, start: int | None = None) -> float:
+    """Estimate of the sd of the residuals at the end of ``start``, by default the best one."""
+    index = best_of(fit) if start is None else start
+    _, n, d = fit.jacobian.shape
+    return float(np.sqrt(2.0 * fit.cost[index] / (n - d)))
+
+
+def covariance_of(fit: LeastSquaresFit, residual_sd: float | None = None, start: int | None = None) -> Covariance:
+    """Covariance at the end of ``start``, by default the best one, with the sd of its own residuals by default."""
+    index = best_of(fit) if start is None else start
+    found = covariance(fit.jacobian[index])
+    return replace(found, matrix=(residual_sd or residual_sd_of(fit, index)) ** 2 * found.matrix)
