@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, printable
 from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, suffix_of
 from capsule_id.rig.formats.layouts import delimiter_of, is_number
@@ -261,9 +261,8 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     if not columns:
         nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
         raise next(iter(unread.values()), InputError(*nothing, path))
-    names, units = _headers(export, dimensions)
-    # Headers are printed: no character of them may command the terminal.
-    names = tuple("".join(mark if mark.isprintable() else " " for mark in name) for name in names)
+    # Entries quote them as comments of rig.toml, which hold no control characters.
+    names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
     return FoundLayout(path, export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
 
 
