@@ -102,7 +102,7 @@ def _data_sets(content: bytes, path: Path) -> Named:
         command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, env=surroundings, start_new_session=True
     ) as process:
         assert process.stdin is not None
-        assert process.stdout is not None
+        assert isinstance(process.stdout, io.BufferedReader)
         watch = threading.Timer(_longest(content), process.kill)
         watch.start()
         try:
@@ -112,7 +112,8 @@ def _data_sets(content: bytes, path: Path) -> Named:
             while (line := process.stdout.readline()).endswith(b"\n"):
                 name, dtype, shape, unit, fault = json.loads(line)
                 if fault is not None:
-                    raise InputError(*fault, path)
+                    rule, value, remedy = fault
+                    raise InputError(rule, value, remedy, path)
                 if name is None:
                     return
                 refuse_large(READING * prod(shape), content, path)
@@ -141,7 +142,7 @@ def serve_hdf5() -> None:
 
             most = 2 * len(content) + 4 * largest(content) + SPARE_MEMORY
             resource.setrlimit(resource.RLIMIT_AS, (most, most))
-            resource.setrlimit(resource.RLIMIT_CPU, (_longest(content),) * 2)
+            resource.setrlimit(resource.RLIMIT_CPU, (_longest(content), _longest(content)))
         with complete(path, "export it again"):
             for name, array, unit in _read_data_sets(content, path):
                 out.write(json.dumps([name, array.dtype.str, array.shape, unit, None]).encode() + b"\n")

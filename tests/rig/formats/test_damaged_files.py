@@ -137,7 +137,7 @@ HOSTILE = {
     "link to another file": (".h5", hidden_file, "a link to another file, y"),
     "readings in another file": (".h5", lambda: hdf5_with(data=None, shape=6, dtype="f8", external="x.bin"), "in another file"),
     "a filter of another library": (".h5", other_filter, "the filter lzf, x"),
-    "readings that were not written": (".h5", lambda: hdf5_with(data=None, shape=10**9, dtype="f8", chunks=10**6), "at most 64 MiB"),
+    "readings not written": (".h5", lambda: hdf5_with(data=None, shape=10**9, dtype="f8", chunks=10**6), "at most 64 MiB"),
     "latest layout of chunks": (".h5", lambda: hdf5_with("latest", chunks=(3,), maxshape=(None,)), None),
     "lzf and scale-offset": (".h5", lambda: hdf5_with(chunks=(3,), compression="lzf", scaleoffset=2), None),
     "a line": (".csv", lambda: b"1" * 50_000_000, f"1:1: a line must have at most {limits.LONGEST_LINE} bytes"),
