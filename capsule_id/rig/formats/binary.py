@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from importlib import import_module
 from math import prod
 from pathlib import Path
 from subprocess import DEVNULL, PIPE
@@ -137,9 +138,8 @@ def serve_hdf5() -> None:
     content, out, path = sys.stdin.buffer.read(), sys.stdout.buffer, Path(sys.argv[1])
     fault: Any = None
     try:
-        with suppress(ImportError):  # Windows has no such limit
-            import resource
-
+        with suppress(ImportError):  # Windows has no such limits; the time is limited by the process that waits
+            resource: Any = import_module("resource")
             most = 2 * len(content) + 4 * largest(content) + SPARE_MEMORY
             resource.setrlimit(resource.RLIMIT_AS, (most, most))
             resource.setrlimit(resource.RLIMIT_CPU, (_longest(content), _longest(content)))
