@@ -4,6 +4,7 @@ import gzip
 import io
 import random
 import struct
+import subprocess
 import time
 import tracemalloc
 import zipfile
@@ -15,7 +16,7 @@ import pytest
 from scipy.io import savemat
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats import EXPORTS
+from capsule_id.rig.formats import EXPORTS, binary
 from capsule_id.rig.formats import raw as limits
 from capsule_id.rig.formats.raw import Layout
 from tests.rig.formats.writers import WRITERS, hdf5, lvm, mat_73, npz, parquet_file, tdms, xlsx
@@ -215,3 +216,14 @@ def test_only_numbers_of_an_archive_are_columns() -> None:
     """Texts, objects and MATLAB's characters are no columns."""
     for suffix, content in ((".npz", npz(COLUMNS)), (".mat", mat_73(COLUMNS)), (".h5", hdf5(COLUMNS))):
         assert EXPORTS[suffix](content, Path(f"f{suffix}"), LAYOUT).headers[0] == ("t", "x")
+
+
+@pytest.mark.parametrize("code", ["while True: pass", "import os; os.abort()", "x = bytearray(1 << 40)"])
+def test_a_library_that_never_returns_or_ends_its_process_is_stopped(
+    code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = subprocess.Popen
+    monkeypatch.setattr(binary, "LONGEST_READING", 1)
+    monkeypatch.setattr(subprocess, "Popen", lambda words, **options: start([*words[:3], code, *words[4:]], **options))
+    error = refusal(".h5", hdf5(COLUMNS))
+    assert "more than 1 s, or ends the HDF5 library" in str(error)
