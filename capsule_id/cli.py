@@ -1,7 +1,6 @@
 """Entry points of the two commands ``fit-params`` and ``capsule-id``: parse, call, exit code."""
 
 import argparse
-import sys
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,7 +21,7 @@ class _Parser(argparse.ArgumentParser):
     """Reports wrong usage in one line on standard error, with exit code 2."""
 
     def error(self, message: str) -> NoReturn:
-        print(" ".join(f"{self.prog}: {message}; see {self.prog} --help".split()), file=sys.stderr)
+        console.complain(" ".join(f"{self.prog}: {message}; see {self.prog} --help".split()))
         raise SystemExit(BAD_INPUT)
 
 
@@ -83,7 +82,7 @@ def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
     try:
         code = _act(program, make_parser, arguments)
     except console.OutputError as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        console.complain(f"{program}: {error}")
         code = INTERNAL
     if arguments is None:  # the process ends with this command
         end_interrupted(code)
@@ -113,15 +112,13 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         console.finish()
         return int(stop.code or 0)
     except InputError as error:
-        print(error, file=sys.stderr)
+        console.complain(error)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print(interrupted, file=sys.stderr)
+        console.complain(interrupted)
         return INTERRUPTED
     except Exception as error:
-        print(
-            f"{program}: internal failure: {console.one_line(error)}; {console.save_traceback(error)}", file=sys.stderr
-        )
+        console.complain(f"{program}: internal failure: {console.one_line(error)}; {console.save_traceback(error)}")
         return INTERNAL
 
 
@@ -139,4 +136,4 @@ def _show_warning(
     text = discard_damaged(str(message))
     if text == str(message):
         text = f"{category.__name__}: {message} ({place})"
-    print(" ".join(f"{program}: warning: {text}".split()), file=sys.stderr)
+    console.complain(" ".join(f"{program}: warning: {text}".split()))

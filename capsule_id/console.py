@@ -19,6 +19,8 @@ from importlib import import_module
 from types import FrameType
 from typing import Any
 
+from capsule_id.errors import printable
+
 # interruption: Interruptions by Ctrl-C or SIGTERM: the handler sets a flag, long computations read it between their
 # steps.
 #
@@ -161,9 +163,14 @@ def prepare() -> None:
 def say(text: str) -> None:
     """Print to standard output and flush; a closed pipe (``| head``) is no error."""
     try:
-        print(text, flush=True)
+        print(printable(text), flush=True)
     except OSError as error:
         _discard(error)
+
+
+def complain(text: object) -> None:
+    """Print to standard error and flush."""
+    print(printable(str(text)), file=sys.stderr, flush=True)
 
 
 def finish() -> None:
@@ -260,6 +267,7 @@ class Progress:
         return tqdm.format_meter(done, total, elapsed, width, self._stage, plain, self._unit, initial=self._first)
 
     def _show(self, line: str) -> None:
+        line = printable(line)
         if self._notebook:
             self._show_in_notebook(line)
             return

@@ -1,8 +1,22 @@
 """The exceptions for bad input; they name place, rule, value and remedy."""
 
+import json
+import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def printable(text: str) -> str:
+    """``text`` without characters that command a terminal: each is written as JSON writes it, ``\\u001b``.
+
+    Every text of a file passes here before it is shown: control characters, and marks that reverse or hide others.
+    Line feeds, tabs and spaces of any width stay.
+    """
+    if text.isprintable():
+        return text
+    kept = (mark.isprintable() or mark in "\n\t" or unicodedata.category(mark) == "Zs" for mark in text)
+    return "".join(mark if keep else json.dumps(mark)[1:-1] for mark, keep in zip(text, kept, strict=True))
 
 
 class InputError(ValueError):
@@ -30,8 +44,7 @@ class InputError(ValueError):
         place = ":".join(str(part) for part in (self.file, line, column) if part not in ("", None))
         message = f"{rule}, {value}, {remedy}"
         text = " ".join((f"{place}: {message}" if place else message).split())
-        # Names in damaged files may hold control characters.
-        super().__init__("".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in text))
+        super().__init__(printable(text))
 
 
 #: Most errors that are printed at once.

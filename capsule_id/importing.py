@@ -340,7 +340,13 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
         If the file cannot be read.
     """
     found = find_layout(content, path, dimensions_of(kinds))
-    guessed, unread = guess(found, kinds), list(_unread_lines(found, dimensions_of(kinds)))
+    guessed = guess(found, kinds)
+    return _entry(found, guessed, content, file, kinds), guessed
+
+
+def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, file: str, kinds: Mapping[str, Kind]) -> str:
+    """The lines of ``[[experiment]]`` for an export with its guess."""
+    unread = list(_unread_lines(found, dimensions_of(kinds)))
     if guessed is None:
         words = " ".join(kinds)
         headers = ", ".join(name for name in found.names if name) or "none"
@@ -363,14 +369,14 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
             *(f"# {line}" for line in _layout_lines(found, replace(found.layout, missing=()))),
             '# columns = { ... = { from = 1, unit = "..." } }',
         ]
-        return "\n".join(lines) + "\n", None
+        return "\n".join(lines) + "\n"
     kind = kinds[guessed.kind]
     lines = [*unread, "[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
     lines += _setting_lines(found, guessed, kind, file)
     lines += ["[experiment.columns]", *_column_lines(found, guessed)]
-    return "\n".join(lines) + "\n", guessed
+    return "\n".join(lines) + "\n"
 
 
 def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str]:
@@ -531,8 +537,7 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
     for row in [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]:
         cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
         lines.append(f"line {found.export.lines[row]}: {'  '.join(cells)}")
-    text, _ = entry_of(content, path, path.name, kinds)
-    return [*lines, "", text.rstrip()]
+    return [*lines, "", _entry(found, guessed, content, path.name, kinds).rstrip()]
 
 
 def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:

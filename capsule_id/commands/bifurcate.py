@@ -3,7 +3,6 @@
 import argparse
 import logging
 import shutil
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from capsule_id.commands.capsule_options import (
     number,
 )
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
-from capsule_id.console import Progress, say
+from capsule_id.console import Progress, complain, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
 from capsule_id.output import PARTIAL, check_parents
@@ -324,7 +323,7 @@ def _measured_points(
     by_name = args.spring if args.k2 is None else None
     span = Span(axes[0].name, x[0], x[-1])
     motions, sentence = overlay(rig, span, values, fitted_values(args.result), by_name)
-    print(sentence, file=sys.stderr, flush=True)
+    complain(sentence)
     return motions
 
 

@@ -1,6 +1,5 @@
 """Fits of one rig or of several: result directory, table, verdict; one after the other, or on a Dask cluster."""
 
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from capsule_id.commands.bifurcate import client_of
 from capsule_id.commands.compilation import prepare_jax
-from capsule_id.console import OnProgress, Progress, one_line, save_traceback, say, stop_if_interrupted
+from capsule_id.console import OnProgress, Progress, complain, one_line, save_traceback, say, stop_if_interrupted
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.kind import Registry, default_registry
@@ -142,7 +141,7 @@ def fit_one(
         changes = wrapped(result.remarks)
         say("\n".join([table, *changes, f"report: {report}", result.verdict]))
     if not result.clean:
-        print(f"fit-params: verdict not clean: {', '.join(result.failed)}; see {report}", file=sys.stderr)
+        complain(f"fit-params: verdict not clean: {', '.join(result.failed)}; see {report}")
     return CLEAN if result.clean else NOT_CLEAN
 
 
@@ -210,7 +209,7 @@ def fit_many(
     parts = [f"verdict not clean: {', '.join(unclean)}"] * bool(unclean)
     parts += [f"{counted(len(failures), 'rig')} not fitted: {'; '.join(failures)}"] * bool(failures)
     if parts:
-        print(f"fit-params: {'; '.join(parts)}", file=sys.stderr)
+        complain(f"fit-params: {'; '.join(parts)}")
     return FAILED if failures else NOT_CLEAN if unclean else CLEAN
 
 

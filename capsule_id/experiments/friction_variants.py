@@ -26,6 +26,8 @@ from capsule_id.views import Finding
 
 #: Ratio of marginal likelihoods above which a variant is rejected, and above which data tell it from the best.
 FACTOR, TELLING = 100.0, 10.0
+#: Coefficients, particles times readings, that are predicted at a time: memory grows with neither.
+MOST_AT_ONCE = 1 << 16
 #: Number of particles, Metropolis steps between two powers, and the part of the particles that a power must keep.
 PARTICLES, MOVES, KEPT = 1000, 6, 0.5
 #: Smallest relative error of a reading: rounding of equal readings.
@@ -113,8 +115,12 @@ class VariantPoints:
 
     def log_likelihood(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> np.ndarray:
         """(s,) natural log-density of the log-coefficients."""
-        raw, sd = self.scaled(model, theta)
-        value = -0.5 * np.sum((raw / sd) ** 2 + LOG_2PI + 2.0 * np.log(sd), axis=1)
+        number, step = len(next(iter(theta.values()))), max(1, MOST_AT_ONCE // len(self.speed))
+        values = []
+        for first in range(0, number, step):
+            raw, sd = self.scaled(model, {name: column[first : first + step] for name, column in theta.items()})
+            values.append(-0.5 * np.sum((raw / sd) ** 2 + LOG_2PI + 2.0 * np.log(sd), axis=1))
+        value = np.concatenate(values)
         return np.where(np.isfinite(value), value, -np.inf)
 
 

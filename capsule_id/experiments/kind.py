@@ -1,10 +1,16 @@
 """Declaration of one kind of experiment, its complete interface to the rest of the package, and the registry of all kinds."""
 
+import os
+import site
+import sysconfig
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import distributions
+from itertools import chain
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
@@ -231,9 +237,26 @@ def _built_in(name: str) -> Kind:
     return place.KIND if hasattr(place, "KIND") else import_module(f"{place.__name__}.declaration").KIND
 
 
+def package_folders() -> list[str]:
+    """The folders of installed packages: those of the interpreter and of the user, and what their ``.pth`` files name.
+
+    ``sys.path`` does not count: it may hold the working folder, which may be a rig folder that somebody else made. That
+    folder never counts; an editable install of a package in it has its metadata beside the ``.pth`` file.
+    """
+    user = [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
+    own = [*site.getsitepackages(), sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), *user]
+    named = list[str]()
+    for file in chain.from_iterable(sorted(Path(folder).glob("*.pth")) for folder in dict.fromkeys(own)):
+        with suppress(OSError):
+            lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+            named += [str(file.parent / line.strip()) for line in lines if line.strip()]
+    found = {os.path.realpath(folder): None for folder in (*own, *named) if os.path.isdir(folder)}  # noqa: PTH112
+    return [folder for folder in found if folder != os.path.realpath(os.curdir)]
+
+
 @cache
 def default_registry() -> Registry:
-    """Return the built-in kinds and those of installed packages; the result is cached.
+    """Return the built-in kinds and those of packages in ``package_folders``; the result is cached.
 
     Raises
     ------
@@ -241,7 +264,9 @@ def default_registry() -> Registry:
         If a package's kind does not load or conflicts with another one; the error names the package.
     """
     registry = Registry(tuple(_built_in(name) for name in BUILT_IN))
-    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+    packages = {package.name: package for package in reversed([*distributions(path=package_folders())])}
+    points = chain.from_iterable(package.entry_points.select(group=GROUP) for package in packages.values())
+    for point in sorted(points, key=lambda point: point.name):
         package = point.dist.name if point.dist is not None else point.value
         remedy = f"update the package {package}, or uninstall it"
         try:

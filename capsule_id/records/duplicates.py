@@ -17,6 +17,8 @@ from capsule_id.rig.filters import PIECE, thinned
 
 #: Expected number of blocks that agree by chance, below which a block counts as repeated.
 CHANCE = 1e-6
+#: Chance of equal rows above which only equal tables count as repeated.
+COARSE = 0.5
 #: Shortest block of a record, samples; shortest record whose noise level is estimated.
 SHORTEST_BLOCK, SHORTEST_RECORD = 8, 50
 #: Width of a scatter, in standard deviations; scatter of a table of single readings, relative to its range.
@@ -122,33 +124,67 @@ def _set_share(column: np.ndarray, rows: np.ndarray) -> float:
 
 
 def repeated_blocks(tables: Sequence[Readings]) -> list[Repeated]:
-    """Return the longest repeated block of each pair of tables, and of each table with itself.
+    """Return the longest repeated block of each pair of tables, and of each table with itself, where there is one.
 
     Parameters
     ----------
     tables : readings with the same columns, so that their rows can be compared
     """
-    found = []
-    for index, later in enumerate(tables):
-        for earlier in tables[: index + 1]:
-            block = _longest_block(earlier, later)
-            if block is not None:
-                found.append(block)
-    return found
+    chances = [chance_of_equality(each) for each in tables]
+    blocks = (
+        _longest_block(tables[i], tables[j], max(chances[i], chances[j])) for i, j in _candidates(tables, chances)
+    )
+    return [block for block in blocks if block is not None]
 
 
-def _longest_block(earlier: Readings, later: Readings) -> Repeated | None:
-    """The longest run of consecutive rows of ``later`` that are rows of ``earlier``; None where chance explains it."""
-    chance = max(chance_of_equality(earlier), chance_of_equality(later))
+def _candidates(tables: Sequence[Readings], chances: Sequence[float]) -> Iterable[tuple[int, int]]:
+    """Indices of the earlier and the later table of each pair that may share a block, each table with itself included.
+
+    They share a window of the shortest length that counts for any pair, or all rows where ``chances`` leave no shorter
+    block. Long tables, of which some windows alone are compared, are paired with all others.
+    """
+    number, fewest = len(tables), max(min((len(each.values) for each in tables), default=1), 1)
+    fine = [k for k in range(number) if chances[k] < COARSE]
+    length = min((_shortest(tables[k], chances[k], len(tables[k].values) * fewest) for k in fine), default=1)
+    windows = []
+    for each, chance in zip(tables, chances, strict=True):
+        if chance >= COARSE:
+            windows.append(np.array([hash((each.values + 0.0).tobytes()) & (1 << 63) - 1], np.uint64))
+            continue
+        moves = np.cumsum([0, *np.any(each.values[1:] != each.values[:-1], axis=1)])
+        hashes = np.concatenate([np.empty(0, np.uint64), *(found for _, found in _hashes(each.values, length))])
+        # At rest all windows are equal, and a repeated block of a record has more changes.
+        moving = moves[length - 1 :] - moves[: len(hashes)] >= length // 4
+        windows.append(np.unique(hashes[moving] if each.record else hashes))
+    codes = {k * number + k for k in range(number)}
+    for k in (k for k, each in enumerate(tables) if len(each.values) >= 2 * PIECE):
+        codes.update(max(k, other) * number + min(k, other) for other in range(number))
+    hashes, owners = np.concatenate(windows), np.repeat(np.arange(number), [len(found) for found in windows])
+    order = np.argsort(hashes, kind="stable")
+    hashes, owners, shift = hashes[order], owners[order], 1
+    while (equal := hashes[shift:] == hashes[:-shift]).any():
+        codes.update(np.unique(owners[shift:][equal] * number + owners[:-shift][equal]).tolist())
+        shift += 1
+    return ((code % number, code // number) for code in sorted(codes))
+
+
+def _shortest(readings: Readings, chance: float, pairs: int) -> int:
+    """Rows of the shortest block of which fewer than ``CHANCE`` agree by chance among ``pairs`` of rows."""
+    return max(int(np.ceil(np.log(CHANCE / pairs) / np.log(chance))), SHORTEST_BLOCK if readings.record else 1)
+
+
+def _longest_block(earlier: Readings, later: Readings, chance: float) -> Repeated | None:
+    """The longest run of consecutive rows of ``later`` that are rows of ``earlier``; None where chance explains it.
+
+    ``chance`` is the larger ``chance_of_equality``.
+    """
     pairs = len(earlier.values) * len(later.values)
-    if chance >= 0.5:
+    if chance >= COARSE:
         # The readings are too coarse for blocks; equal tables of several rows remain.
         if earlier is not later and len(later.values) > 2 and np.array_equal(earlier.values, later.values):
             return Repeated(later.label, 0, earlier.label, 0, len(later.values))
         return None
-    # With ``shortest`` rows the expected number of chance agreements is below CHANCE.
-    shortest = int(np.ceil(np.log(CHANCE / pairs) / np.log(chance)))
-    shortest = max(shortest, SHORTEST_BLOCK if later.record else 1)
+    shortest = _shortest(later, chance, pairs)
     if min(len(earlier.values), len(later.values)) < shortest + (earlier is later):
         return None
     best: Repeated | None = None

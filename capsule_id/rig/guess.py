@@ -5,19 +5,19 @@ import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, pairwise, product
+from itertools import groupby, islice, pairwise, product
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, printable
 from capsule_id.rig.filters import clock_starts
-from capsule_id.rig.formats import EXPORTS, suffix_of
+from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
 from capsule_id.rig.formats.layouts import delimiter_of, is_number
 from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile
-from capsule_id.rig.formats.text import bare, cells_of, is_row
+from capsule_id.rig.formats.text import bare, is_row, texts_of
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
 
@@ -184,8 +184,9 @@ def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:
 MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "#N/A", "?")
 #: Largest share of missing readings in a column of readings.
 MOST_MISSING = 0.5
-_BEGINNING = 100_000  # bytes in which the first row of readings is searched
+_BEGINNING, _MOST_LINES = 100_000, 3_000  # bytes and lines in which the first row of readings is searched
 _MOST_TITLES = 100  # lines
+_MOST_SEARCHED = 500_000  # lines of a text that are searched for blocks of readings
 #: Separator and number of cells of a line whose first cell is a number; None for any other line.
 Cells = tuple[str | None, int] | None
 _RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
@@ -242,7 +243,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     if suffix not in EXPORTS:
         known = " ".join(EXPORTS)
         raise InputError(f"a file must have a known format ({known})", path.name, "export it as CSV", path)
-    text = suffix.removesuffix(COMPRESSED) in (".csv", ".txt", ".tsv", ".dat")
+    text = suffix.removesuffix(COMPRESSED) in TEXTS and not suffix.startswith(".lvm")
     beginning = _beginning(TextFile(content, path)) if text else b""
     blocks: tuple[tuple[int, int], ...] = ()
     layout = Layout(missing=MARKERS)
@@ -261,18 +262,20 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     if not columns:
         nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
         raise next(iter(unread.values()), InputError(*nothing, path))
-    names, units = _headers(export, dimensions)
-    # Headers are printed: no character of them may command the terminal.
-    names = tuple("".join(mark if mark.isprintable() else " " for mark in name) for name in names)
+    # Entries quote them as comments of rig.toml, which hold no control characters.
+    names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
     return FoundLayout(path, export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
 
 
 def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
     """First and last lines of the blocks of readings of a text.
 
-    () where a single line with numbers interrupts or ends them, which is a damaged row.
+    () where a single line with numbers interrupts or ends them, which is a damaged row, and for a very long text.
     """
-    runs, longest = _runs(file.lines(), layout)
+    lines = [*islice(file.lines(), _MOST_SEARCHED + 1)]
+    if len(lines) > _MOST_SEARCHED:
+        return ()
+    runs, longest = _runs(lines, layout)
     after_block = [run for before, run in pairwise(runs) if before[0] == longest]
     if any(cells is not None and len(numbers) == 1 for cells, numbers in after_block):
         return ()
@@ -300,10 +303,9 @@ def _runs(lines: Iterable[str], layout: Layout) -> tuple[list[tuple[Cells, list[
 def _cells_of_row(line: str, layout: Layout) -> Cells:
     """Separator and number of cells of a line that begins with a number, or a missing one before others; else None."""
     delimiter = delimiter_of(line, layout)
-    cells = cells_of(line, delimiter)
-    texts = [bare(cell[0]) for cell in cells]
+    texts = [bare(cell) for cell in texts_of(line, delimiter)]
     begins = is_number(texts[0]) or (texts[0] in layout.missing and any(map(is_number, texts)))
-    return (delimiter, len(cells)) if begins else None
+    return (delimiter, len(texts)) if begins else None
 
 
 def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
@@ -319,7 +321,15 @@ def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layo
             return False
         return True
 
-    missing = () if reads(()) else MARKERS
+    suffix = suffix_of(found.path).removesuffix(COMPRESSED)
+    text = TextFile(content, found.path) if suffix in TEXTS else None
+    known = ("NaN",) if text is None and suffix != ".xlsx" else MARKERS
+    missing = tuple(marker for marker in known if text is None or text.has_cell(marker))
+    gaps = any(np.isnan(found.columns[column]).any() for column in used)
+    if not gaps and reads(()):
+        missing = ()
+    if gaps and len(missing) == 1:  # a long file takes seconds to read
+        return replace(found.layout, missing=missing)
     for marker in missing:
         fewer = tuple(each for each in missing if each != marker)
         missing = fewer if reads(fewer) else missing
@@ -327,9 +337,10 @@ def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layo
 
 
 def _beginning(file: TextFile) -> bytes:
-    """The first lines of a text in UTF-8, about ``_BEGINNING`` bytes."""
+    """The first ``_MOST_LINES`` lines of a text in UTF-8, about ``_BEGINNING`` bytes of them."""
     text = next(file.blocks(), (0, b""))[1]
-    return text[: text.rfind(b"\n", 0, _BEGINNING) + 1 or text.find(b"\n") + 1]
+    lines = text[: text.rfind(b"\n", 0, _BEGINNING) + 1 or text.find(b"\n") + 1].splitlines(keepends=True)
+    return b"".join(lines[:_MOST_LINES])
 
 
 def _text_layout(beginning: bytes, path: Path) -> Layout:

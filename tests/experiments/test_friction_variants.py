@@ -1,5 +1,6 @@
 """Comparison of friction laws: evidence against quadrature, false alarms on clean twins, controls, the remedy."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from scipy import stats
 
 import capsule_id as cid
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments import friction_variants, make_experiments
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.friction import FrictionExperiment, paper_friction_fit
 from capsule_id.experiments.friction_model import FrictionModel, model_lines
@@ -149,3 +150,16 @@ def test_lines_of_model() -> None:
     assert model_lines(FrictionModel()) == 'friction = "stribeck"'
     lines = model_lines(FrictionModel(free=("viscous",), constant=True))
     assert lines == 'friction = "constant", and on the next line free = ["viscous"]'
+
+
+def test_memory_grows_neither_with_particles_nor_with_readings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: 160 kB a reading. The densities are the same to the last bit."""
+    rng, model = np.random.default_rng(0), FrictionModel()
+    points = VariantPoints(experiments(np.tile(SPEED, 200), np.tile(LEVEL_READINGS, 200)))
+    theta = {row.symbol: np.exp(rng.normal(-2.0, 0.1, 300)) for row in points.rows(model)}
+    tracemalloc.start()
+    values = points.log_likelihood(model, theta)
+    assert tracemalloc.get_traced_memory()[1] < 10e6
+    tracemalloc.stop()
+    monkeypatch.setattr(friction_variants, "MOST_AT_ONCE", 10**9)
+    np.testing.assert_array_equal(values, points.log_likelihood(model, theta))

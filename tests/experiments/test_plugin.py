@@ -6,6 +6,8 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
+import venv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import kind as registry
 from capsule_id.experiments.base import ValuesBySymbol
-from capsule_id.experiments.kind import GROUP, Registry, default_registry
+from capsule_id.experiments.kind import GROUP, Registry, default_registry, package_folders
 from capsule_id.experiments.point_test import PointTest
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
@@ -44,7 +46,7 @@ FORCES = (0.0638, 0.0618, 0.0628, 0.0633, 0.0623)
 
 
 def install(site: Path, target: str = "rolling_rig:KIND") -> Path:
-    """``site`` as ``pip install --target`` leaves it: the packages, and metadata with an entry point."""
+    """``site`` as ``pip install`` leaves it: the packages, and metadata with an entry point."""
     info = site / "rolling_rig-0.1.dist-info"
     info.mkdir(parents=True)
     shutil.copytree(PLUGIN, site / "rolling_rig", ignore=shutil.ignore_patterns("__pycache__"))
@@ -54,15 +56,28 @@ def install(site: Path, target: str = "rolling_rig:KIND") -> Path:
     return site
 
 
+def environment_in(folder: Path) -> tuple[Path, Path]:
+    """A virtual environment with the packages of this one beside its own: its Python, and its package folder."""
+    venv.create(folder, symlinks=os.name == "posix")
+    places = {"base": str(folder), "platbase": str(folder)}
+    site = Path(sysconfig.get_path("purelib", "venv", places))
+    (site / "shared.pth").write_text(f"{cli_tools.ROOT}\n{sysconfig.get_path('purelib')}\n", encoding="utf-8")
+    return Path(sysconfig.get_path("scripts", "venv", places)) / Path(sys.executable).name, site
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return install(tmp_path_factory.mktemp("site"))
+    """The Python of an environment with the package."""
+    python, site = environment_in(tmp_path_factory.mktemp("site") / ".venv")
+    install(site)
+    return python
 
 
-def run(site: Path, *words: str, name: str = "capsule_id") -> subprocess.CompletedProcess[str]:
-    """A command with the package in ``site`` installed."""
-    paths = os.pathsep.join([str(cli_tools.ROOT), str(site)])
-    return cli_tools.run(*words, cwd=site, name=name, env=cli_tools.environment(PYTHONPATH=paths))
+def run(python: Path, *words: str, name: str = "capsule_id") -> subprocess.CompletedProcess[str]:
+    """A command of an environment, started in the folder that holds the environment."""
+    command = [str(python), *cli_tools.argv(*words, name=name)[1:]]
+    quiet = {"capture_output": True, "text": True, "check": False, "timeout": 300}
+    return subprocess.run(command, cwd=python.parents[2], env=cli_tools.environment(PYTHONPATH=None), **quiet)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +107,7 @@ def test_check_reads_and_lints_it(site: Path, folder: Path) -> None:
 @pytest.mark.full
 def test_without_the_package_the_kind_is_unknown(folder: Path, tmp_path: Path) -> None:
     """The negative control."""
-    done = run(tmp_path, "check", str(folder))
+    done = cli_tools.run("check", str(folder), name="capsule_id", cwd=tmp_path)
     assert done.returncode == 2
     assert "unknown kind, 'rolling_resistance'" in done.stderr
 
@@ -123,13 +138,39 @@ def test_it_is_fitted_and_reported(site: Path, folder: Path, tmp_path: Path) -> 
 def load(site: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
     """The default registry, made anew with the package in ``site`` installed."""
     monkeypatch.syspath_prepend(site)
+    monkeypatch.setattr(registry.site, "getsitepackages", lambda: [str(site)])
     for name in [name for name in sys.modules if name.split(".")[0] in ("rolling_rig", "towing_rig")]:
         monkeypatch.delitem(sys.modules, name)
     return default_registry.__wrapped__()
 
 
-def test_its_parameters_and_settings_join_those_of_the_package(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kinds = load(site, monkeypatch)
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The packages alone, in a folder."""
+    return install(tmp_path_factory.mktemp("packages"))
+
+
+def test_code_of_the_working_folder_is_not_loaded(packages: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: a planted ``*.dist-info`` in the folder of a rig ran there. Negative control: the same, installed."""
+    monkeypatch.chdir(packages)
+    monkeypatch.syspath_prepend("")
+    assert list(default_registry.__wrapped__()) == list(KINDS)
+    assert "rolling_rig" not in sys.modules
+    monkeypatch.chdir(packages.parent)
+    assert "rolling_resistance" in load(packages, monkeypatch)
+
+
+def test_a_pth_file_names_a_folder_of_packages(packages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = f"# a comment\nimport sys; sys.exit(1)\n\n{packages}\n/no/such/folder\n\0\n"
+    (tmp_path / "editable.pth").write_text(lines, encoding="utf-8")
+    monkeypatch.setattr(registry.site, "getsitepackages", lambda: [str(tmp_path)])
+    assert {str(tmp_path), str(packages)} <= set(package_folders())
+    monkeypatch.chdir(packages)
+    assert str(packages) not in package_folders()
+
+
+def test_its_parameters_and_settings_join_those_of_the_package(packages: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = load(packages, monkeypatch)
     assert list(kinds) == [*KINDS, "rolling_resistance"]
     assert set(kinds.parameters) - set(KINDS.parameters) == {"c_rr", "rolling_scatter"}
     assert kinds["rolling_resistance"].required == ("wheel",)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from capsule_id.records import duplicates
 from capsule_id.records.duplicates import Readings, reading_step, repeated_blocks
 from capsule_id.records.faults import (
     Gaps,
@@ -279,3 +280,22 @@ def test_a_noisy_place_is_no_jump(seed: int) -> None:
     jump = cast(Jump, jump_or_noise(lost, 100.0, alone=True))
     assert not jump.noisy
     assert abs(jump.row - 2025) < 25
+
+
+@pytest.mark.parametrize("coarse", [1e-5, 1e-2, 1.0])
+def test_pairs_that_share_no_window_are_not_compared(coarse: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: all pairs, 5 ms each. The blocks are those of all pairs: rest and coarse readings recur everywhere."""
+    rng, time = np.random.default_rng(5), np.arange(300) * 0.002
+    decays = np.exp(-4.0 * time) * np.cos(118.0 * time + rng.uniform(0.0, 6.0, (40, 1))) * 5.0
+    decays = np.round((decays + 0.01 * rng.standard_normal(decays.shape)) / coarse) * coarse
+    decays[:, 260:] = 0.0
+    decays[7, 40:90], decays[30, 20:70], decays[39] = decays[3, 100:150], decays[30, 150:200], decays[12]
+    tables = [Readings(f"d{k}", decay[:, None], True) for k, decay in enumerate(decays)]
+    compared, longest = [], duplicates._longest_block
+    monkeypatch.setattr(duplicates, "_longest_block", lambda *words: (compared.append(words[:2]), longest(*words))[1])
+    found = repeated_blocks(tables)
+    assert len(compared) < 2 * len(tables)
+    pairs = [(i, j) for j in range(len(tables)) for i in range(j + 1)]
+    monkeypatch.setattr(duplicates, "_candidates", lambda *_: pairs)
+    assert found == repeated_blocks(tables)
+    assert len(found) >= (1 if coarse == 1.0 else 3)

@@ -12,7 +12,7 @@ from capsule_id.rig.formats.layouts import read_lvm, read_text
 from capsule_id.rig.formats.raw import COMPRESSED, Content, Export, Layout, RawTable
 from capsule_id.rig.formats.text import read_csv
 
-_TEXTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
+TEXTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
     ".csv": read_text,
     ".txt": read_text,
     ".tsv": read_text,
@@ -33,8 +33,8 @@ READERS: Mapping[str, Callable[[Content, Path], RawTable]] = {
     **{suffix + COMPRESSED: read for suffix, read in _TABLES.items()},
 }
 EXPORTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
-    **_TEXTS,
-    **{suffix + COMPRESSED: read for suffix, read in _TEXTS.items()},
+    **TEXTS,
+    **{suffix + COMPRESSED: read for suffix, read in TEXTS.items()},
     ".mat": read_mat,
     ".npz": read_npz,
     ".h5": read_hdf5,

@@ -1,14 +1,23 @@
 """Readers of binary files: HDF5, MATLAB, NumPy, Parquet, TDMS, Excel."""
 
 import io
+import json
 import logging
+import os
 import struct
+import subprocess
+import sys
+import threading
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib import import_module
 from math import prod
 from pathlib import Path
+from subprocess import DEVNULL, PIPE
 from typing import Any
 
 import numpy as np
@@ -17,11 +26,14 @@ from capsule_id.errors import InputError
 from capsule_id.rig.formats.layouts import read_text
 from capsule_id.rig.formats.raw import (
     LARGEST_CONTENT,
+    READING,
+    SPREAD,
     Content,
     Export,
     Layout,
     complete,
     export_of_arrays,
+    largest,
     refuse_large,
     require,
     whole,
@@ -59,51 +71,162 @@ class ArraysReader:
         """
         if self.package:
             require(self.package, path)
+        arrays, units, readings = dict[str, np.ndarray](), dict[str, str](), 0
         with complete(path, self.remedy):
-            found = [(name, array, unit) for name, array, unit in self.find(whole(content), path) if array is not None]
-        units = {name: unit for name, _, unit in found}
-        return export_of_arrays({name: array for name, array, _ in found}, path, layout, units)
+            content = whole(content)
+            for name, array, units[name] in self.find(content, path):
+                if array is not None:
+                    arrays[name], readings = array, readings + array.size
+                    refuse_large(READING * readings, content, path)
+        return export_of_arrays(arrays, path, layout, units)
 
 
 # hdf5: Reads HDF5 files, among them MATLAB files of version 7.3: every real numeric data set is a column, or a matrix.
 #
-# pyfive reads them. It is written in Python; h5py's C library never returns from some damaged files. A file
-# with links to other files is refused: only its own bytes count.
+# h5py reads them in a process of its own: from some damaged files its C library never returns, others end the process.
+# The file is given as bytes, so that no other file is read.
 
 
-#: Fewest bytes of a chunk with its entry in the index.
-SMALLEST_CHUNK = 16
+#: Longest time to read a small HDF5 file, s, bytes that a larger one has for each further second, and memory of the
+#: process beyond that of the file, bytes.
+LONGEST_READING, BYTES_PER_SECOND, SPARE_MEMORY = 8, 1 << 25, 1 << 29
 
 
 def _data_sets(content: bytes, path: Path) -> Named:
     """The data sets of an HDF5 file; their names are paths such as ``group/x``."""
-    import pyfive
+    command = [sys.executable, "-P", "-c", f"from {__name__} import serve_hdf5; serve_hdf5()", path.name]
+    paths = os.pathsep.join(place for place in sys.path if place)
+    threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # the memory of their stacks counts
+    surroundings = {**os.environ, **threads, "PYTHONPATH": paths}
+    # In a session of its own Ctrl-C reaches this process alone.
+    with subprocess.Popen(
+        command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, env=surroundings, start_new_session=True
+    ) as process:
+        assert process.stdin is not None
+        assert isinstance(process.stdout, io.BufferedReader)
+        watch = threading.Timer(_longest(content), process.kill)
+        watch.start()
+        try:
+            with suppress(OSError):  # the process has ended
+                process.stdin.write(content)
+                process.stdin.close()
+            while (line := process.stdout.readline()).endswith(b"\n"):
+                name, dtype, shape, unit, fault = json.loads(line)
+                if fault is not None:
+                    rule, value, remedy = fault
+                    raise InputError(rule, value, remedy, path)
+                if name is None:
+                    return
+                refuse_large(READING * prod(shape), content, path)
+                array = np.empty(shape, dtype)
+                if process.stdout.readinto(array.data.cast("B")) != array.nbytes:
+                    break
+                yield name, array, unit
+            raise ValueError(f"reading it takes more than {_longest(content)} s, or ends the HDF5 library")
+        finally:
+            watch.cancel()
+            process.kill()
 
-    everything, size = list[tuple[str, Any]](), 0
+
+def _longest(content: bytes) -> int:
+    """Longest time to read an HDF5 file, s."""
+    return LONGEST_READING + len(content) // BYTES_PER_SECOND
+
+
+def serve_hdf5() -> None:
+    """Read the HDF5 file of standard input; write a line of JSON and the bytes of each data set to standard output."""
+    content, out, path = sys.stdin.buffer.read(), sys.stdout.buffer, Path(sys.argv[1])
+    fault: Any = None
+    try:
+        with suppress(ImportError):  # Windows has no such limits; the time is limited by the process that waits
+            resource: Any = import_module("resource")
+            most = 2 * len(content) + 4 * largest(content) + SPARE_MEMORY
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
+            resource.setrlimit(resource.RLIMIT_CPU, (_longest(content), _longest(content)))
+        with complete(path, "export it again"):
+            for name, array, unit in _read_data_sets(content, path):
+                out.write(json.dumps([name, array.dtype.str, array.shape, unit, None]).encode() + b"\n")
+                out.write(array.data)
+    except InputError as error:
+        fault = error.rule, error.value, error.remedy
+    out.write(json.dumps([None, "", [], "", fault]).encode() + b"\n")
+    out.flush()
+
+
+def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarray, str]]:
+    """The real numeric data sets; empty ones are left out.
+
+    Raises
+    ------
+    InputError
+        Where readings lie in another file, or were never written.
+    """
+    import h5py
+
+    readings = 0
     # MATLAB stores the columns of a matrix one after the other, which HDF5 sees as rows.
     by_columns = content.startswith(b"MATLAB 7.3")
-    with pyfive.File(io.BytesIO(content)) as file:
-        file.visititems(lambda name, found: everything.append((name, found)))
-        for name, found in everything:
-            if not isinstance(found, pyfive.Dataset) or found.ndim not in (1, 2):
+    with h5py.File(io.BytesIO(content)) as file:
+        links = dict[str, Any]()
+        file.visititems_links(links.__setitem__)
+        for name, link in links.items():
+            found = file[name] if isinstance(link, h5py.HardLink) else link
+            for feature in _unreadable(found):
+                rule = f"a {path.suffix} file must hold its readings itself, by filters of the HDF5 library"
+                raise InputError(
+                    rule, f"{feature}, {name}", "write the readings into this file, uncompressed or by gzip"
+                )
+            if not isinstance(found, h5py.Dataset) or not found.size or found.ndim not in (1, 2):
                 continue
-            if getattr(found.dtype, "kind", "") not in ("f", "i", "u"):
+            if found.dtype.kind not in "fiu":
                 continue
             # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
-            if found.attrs.get("MATLAB_class") == b"char" or name.startswith("#") or "MATLAB_empty" in found.attrs:
+            if (
+                found.attrs.get("MATLAB_class") in (b"char", "char")
+                or name.startswith("#")
+                or "MATLAB_empty" in found.attrs
+            ):
                 continue
-            size += found.size * found.dtype.itemsize
-            refuse_large(size, path)
-            chunks = prod(
-                -(-length // step) for length, step in zip(found.shape, found.chunks or found.shape, strict=True)
-            )
-            if chunks > max(len(content) // SMALLEST_CHUNK, 1):  # pyfive looks for every one of them
-                raise ValueError(f"{name} states {chunks} chunks in a file of {len(content)} bytes")
-            array, unit = np.asarray(found[()]), found.attrs.get("units", found.attrs.get("unit"))
-            yield name, array.T if by_columns else array, unit if isinstance(unit, str) else ""
+            readings += found.size
+            refuse_large(READING * readings, content, path)
+            array, unit = _written(found), found.attrs.get("units", found.attrs.get("unit"))
+            unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
+            yield name, np.ascontiguousarray(array.T if by_columns else array), unit if isinstance(unit, str) else ""
 
 
-read_hdf5 = ArraysReader(_data_sets, "export it again", "pyfive")
+def _unreadable(found: Any) -> Iterator[str]:
+    """The features of a link or an object that keep its readings from being read."""
+    import h5py
+
+    if isinstance(found, h5py.ExternalLink):
+        yield "a link to another file"
+    if isinstance(found, h5py.Dataset):
+        made = found.id.get_create_plist()
+        filters = [made.get_filter(k) for k in range(made.get_nfilters())]
+        missing = [
+            name.decode("utf-8", "replace") or code for code, _, _, name in filters if not h5py.h5z.filter_avail(code)
+        ]
+        yield from (f"the filter {name}" for name in missing)
+        yield from ["a data set in another file"] * bool(found.external)
+        yield from ["a virtual data set"] * found.is_virtual
+
+
+def _written(found: Any) -> np.ndarray:
+    """The readings of a data set; NaN instead of the fill value where none was written."""
+    array, chunks = found[()], found.chunks
+    if chunks is None:
+        return array if found.id.get_storage_size() else np.full(array.shape, np.nan)
+    stored = found.id.get_num_chunks()
+    if stored == prod(-(-length // step) for length, step in zip(array.shape, chunks, strict=True)):
+        return array
+    written = np.zeros(array.shape, bool)
+    for k in range(stored):
+        offset = found.id.get_chunk_info(k).chunk_offset
+        written[tuple(slice(start, start + step) for start, step in zip(offset, chunks, strict=True))] = True
+    return np.where(written, array, np.nan)
+
+
+read_hdf5 = ArraysReader(_data_sets, "export it again")
 
 
 # mat: Reads MATLAB files: every real numeric variable is a column, of a matrix every column; so is a field of a struct.
@@ -139,32 +262,27 @@ def read_mat(content: Content, path: Path, layout: Layout) -> Export:
         If it is no MATLAB file, is damaged, or has no numeric variable.
     """
     content = whole(content)
-    if content.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF")):
-        return read_hdf5(content, path, layout)
-    return export_of_arrays(_variables(content, path), path, layout)
+    hdf5 = content.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF"))
+    return (read_hdf5 if hdf5 else _read_mat_5)(content, path, layout)
 
 
-def _variables(content: bytes, path: Path) -> dict[str, np.ndarray]:
-    """The real numeric arrays by name; other variables are left out."""
+def _variables(content: bytes, path: Path) -> Named:
+    """The real numeric arrays; other variables are left out."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
-    try:
-        if order is None:
-            raise ValueError("no header of a MATLAB file")
-        variables: dict[str, np.ndarray] = {}
-        for kind, element in _elements(content[128:], order):
-            if kind == _COMPRESSED:
-                unpacked = zlib.decompressobj().decompress(element, LARGEST_CONTENT)
-                kind, element = next(_elements(unpacked, order), (0, b""))
-            for name, values in _arrays(kind, element, order):
-                variables[name] = values
-                refuse_large(sum(values.nbytes for values in variables.values()), path)
-        return variables
-    except InputError:
-        raise
-    except (ValueError, struct.error, zlib.error) as error:
-        raise InputError(
-            "a MATLAB file must be complete", str(error), "save it again by save(..., '-v7')", path
-        ) from None
+    if order is None:
+        raise ValueError("no header of a MATLAB file")
+    unpacked = 0
+    for kind, element in _elements(content[128:], order):
+        if kind == _COMPRESSED:
+            data = zlib.decompressobj().decompress(element, LARGEST_CONTENT >> 2)
+            unpacked += len(data)
+            refuse_large(unpacked // 2, content, path)
+            kind, element = next(_elements(data, order), (0, b""))
+        for name, values in _arrays(kind, element, order):
+            yield name, values, ""
+
+
+_read_mat_5 = ArraysReader(_variables, "save it again by save(..., '-v7')")
 
 
 def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
@@ -204,7 +322,7 @@ def _arrays(
         number, data = next(parts, (0, b""))
         if number not in _NUMBERS:
             raise ValueError(f"an array of type {number}")
-        values = np.frombuffer(data, order + _NUMBERS[number]).astype(np.float64)
+        values = np.frombuffer(data, order + _NUMBERS[number])
         if len(shape) == 2:
             if min(shape) < 0 or values.size != shape[0] * shape[1]:
                 raise ValueError(f"{values.size} values in an array of {shape}")
@@ -236,7 +354,7 @@ def _members(content: bytes, path: Path) -> Named:
     """The arrays of an archive."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
-        refuse_large(sum(member.file_size for member in members), path)
+        refuse_large(sum(member.file_size for member in members) // 2, content, path)
         for member in members:
             # ``read`` returns at most the stated size of the member.
             yield member.filename.removesuffix(".npy"), _numbers(archive.read(member)), ""
@@ -279,7 +397,7 @@ def _columns(content: bytes, path: Path) -> Named:
             "write it again",
             path,
         )
-    refuse_large(8 * file.metadata.num_rows * len(numeric), path)
+    refuse_large(READING * file.metadata.num_rows * len(numeric), content, path)
     table = file.read(columns=numeric, use_threads=False)
     yield from ((name, table.column(name).to_numpy(), "") for name in table.column_names)
 
@@ -316,7 +434,7 @@ def _channels(content: bytes, path: Path) -> Named:
             if not 0 <= scales <= MOST_SCALES:  # npTDMS makes a list of so many elements
                 raise ValueError(f"{scales} scales of a channel")
         channels = [channel for channel in everything if channel.dtype.kind in "fiu"]
-        refuse_large(8 * sum(len(channel) for channel in channels), path)
+        refuse_large(READING * sum(len(channel) for channel in channels), content, path)
         names = [channel.name for channel in channels]
         for channel in channels:
             name = channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}"
@@ -344,6 +462,8 @@ read_tdms = ArraysReader(_channels, "export it again, or as text", "npTDMS")
 
 #: Most cells of a sheet; one takes 50 bytes in the file, and a few hundred while it is read.
 MOST_CELLS = 2_000_000
+#: Cells that a row without cells counts.
+BLANK_ROW = 20
 
 
 def read_xlsx(content: Content, path: Path, layout: Layout) -> Export:
@@ -363,17 +483,7 @@ def read_xlsx(content: Content, path: Path, layout: Layout) -> Export:
         If openpyxl is not installed, the file is damaged or too large, or the rows of numbers are not found.
     """
     require("openpyxl", path)
-    import openpyxl
-
-    with complete(path, "save it again"):
-        content = whole(content)
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            refuse_large(sum(member.file_size for member in archive.infolist()), path)
-        book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
-        sheets = (_rows(sheet, path) for sheet in book.worksheets)
-        rows = next((rows for rows, numbers in sheets if numbers), [])
-    width = max((k + 1 for row in rows for k, cell in enumerate(row) if cell), default=0)
-    lines = ["\t".join([*row[:width], *[""] * (width - len(row)), ""]) if any(row) else "" for row in rows]
+    lines = _lines_of_book(whole(content), path)
     try:
         export = read_text("\n".join(lines).encode(), path, layout)
     except InputError as error:
@@ -388,6 +498,29 @@ def read_xlsx(content: Content, path: Path, layout: Layout) -> Export:
     return replace(export, values=values, place=lambda row, column: (*export.place(row, column)[:2], column + 1))
 
 
+@lru_cache(maxsize=1)  # the guesses of a layout read a file several times
+def _lines_of_book(content: bytes, path: Path) -> list[str]:
+    """The first sheet with numbers as lines of text, the cells between tabs."""
+    import openpyxl
+
+    with complete(path, "save it again"):
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            refuse_large(sum(member.file_size for member in archive.infolist()), content, path)
+        book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
+        sheets = (_rows(sheet, path) for sheet in book.worksheets)
+        rows = next((rows for rows, numbers in sheets if numbers), [])
+    width = max((k + 1 for row in rows for k, cell in enumerate(row) if cell), default=0)
+    if width * len(rows) > SPREAD * MOST_CELLS:
+        raise _too_many(path)
+    return ["\t".join([*row[:width], *[""] * (width - len(row)), ""]) if any(row) else "" for row in rows]
+
+
+def _too_many(path: Path) -> InputError:
+    return InputError(
+        f"a sheet must have at most {MOST_CELLS} cells", "more", "export the record as CSV or Parquet", path
+    )
+
+
 def _rows(sheet: Any, path: Path) -> tuple[list[list[str]], bool]:
     """The cells of a sheet as text, each in one line, and whether one of them is a number."""
     rows, cells, numbers = [], 0, False
@@ -395,11 +528,9 @@ def _rows(sheet: Any, path: Path) -> tuple[list[list[str]], bool]:
         return rows, numbers
     sheet.reset_dimensions()  # the stated size of a sheet can be far larger than the sheet
     for row in sheet.iter_rows(values_only=True):
-        cells += len(row)
+        cells += len(row) or BLANK_ROW  # the stated number of a row can lie far below the last one
         if cells > MOST_CELLS:
-            raise InputError(
-                f"a sheet must have at most {MOST_CELLS} cells", "more", "export the record as CSV or Parquet", path
-            )
+            raise _too_many(path)
         real = [isinstance(cell, int | float) and not isinstance(cell, bool) for cell in row]
         numbers = numbers or any(real)
         texts = zip(row, real, strict=True)

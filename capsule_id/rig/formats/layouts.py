@@ -12,7 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Content, Export, Layout, Place, TextFile, occurrences, refuse_line
+from capsule_id.rig.formats.raw import (
+    MOST_TITLES,
+    Content,
+    Export,
+    Layout,
+    Place,
+    TextFile,
+    occurrences,
+    refuse_line,
+    refuse_wide,
+)
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
@@ -29,6 +39,7 @@ from capsule_id.rig.formats.text import (
     plain_table,
     read_column,
     shown_cell,
+    texts_of,
 )
 
 # any layout: Reads text exports of any layout: titles, headers, rows of units, comments, and any separator.
@@ -61,10 +72,11 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     delimiter = delimiter_of(row, layout)
     _refuse_ambiguous_comma(file, first, delimiter, layout)
     _refuse_separator_in_quotes(file, first, row, delimiter)
-    *cells, last = (cell for cell, _ in cells_of(row, delimiter))
+    *cells, last = texts_of(row, delimiter)
     blank = bool(cells) and not last
-    trailing = blank and all(not cells_of(line, delimiter)[-1][0] for line in file.lines(first) if is_row(line))
+    trailing = blank and all(not texts_of(line, delimiter)[-1] for line in file.lines(first) if is_row(line))
     width = len(cells) + (not trailing)
+    refuse_wide(width, path, first + 1)
     above = range((layout.data_from_line or first + 1) - 2, -1, -1)
     found = [(i, names) for i in above if (names := _headers(head[i], delimiter, width, layout))]
     headers = tuple(names for _, names in found)
@@ -119,6 +131,8 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
     begun = None
     for i, line in enumerate(file.lines()):
         lines.append(line)
+        if i >= MOST_TITLES and layout.data_from_line is None:
+            break
         if is_comment(line):
             continue
         if layout.data_from_line is not None:
@@ -150,9 +164,9 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
         )
     if begun is None:
         raise InputError(
-            "a table must have rows of numbers",
+            f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
             "none",
-            "export the readings as text",
+            "export the readings as text, or state data_from_line",
             file.path,
             1 if layout.data_from_line is None else len(lines),
             1,
@@ -201,7 +215,7 @@ def _header_cells(line: str, delimiter: str | None) -> Iterator[list[str]]:
 
 def _split(line: str, delimiter: str | None) -> list[str]:
     """The cells of a line without blanks and quotation marks around them."""
-    return [bare(cell) for cell, _ in cells_of(line, delimiter)]
+    return [bare(cell) for cell in texts_of(line, delimiter)]
 
 
 def delimiter_of(line: str, layout: Layout) -> str | None:
@@ -209,7 +223,7 @@ def delimiter_of(line: str, layout: Layout) -> str | None:
     for mark in "\t;":
         if mark in line:
             return mark
-    words = [word for word, _ in cells_of(line, None)]
+    words = texts_of(line, None)
     if layout.decimal == ",":  # a tab separates nothing in a line with one cell
         return None if len(words) > 1 else "\t"
     if "," not in line:
@@ -282,8 +296,6 @@ _END = "***End_of_Header***"
 _SPECIAL, _END_SPECIAL = "***Start_Special***", "***End_Special***"
 _TIMES, _COMMENT = "X_Value", "Comment"
 _REMEDY = "export the record again"
-#: Lines in which the headers of a record of one segment end.
-_HEAD = 10_000
 
 
 @dataclass(frozen=True)
@@ -410,7 +422,7 @@ def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> "tuple[_Fi
     """A file with one segment of numbers alone, read in blocks, with its wanted columns; None for any other file."""
     head: list[str] = []
     ends = 0
-    for line in islice(text.lines(), _HEAD):
+    for line in islice(text.lines(), MOST_TITLES):
         head.append(line)
         ends += line.startswith(_END)
         if ends == 2 and len(head) > 2 and head[-3].startswith(_END):

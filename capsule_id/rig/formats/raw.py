@@ -20,25 +20,55 @@ from capsule_id.errors import InputError
 
 #: The bytes of a file, or where they lie.
 Content = bytes | Path
-#: Largest decompressed size of a file, bytes. It stops archives that grow without limit when they are unpacked.
-LARGEST_CONTENT = 1 << 30
+#: Largest decompressed size of a file, bytes; of a small one the larger of ``SMALL_CONTENT`` and ``SPREAD`` times its own
+#: size. It stops files that grow without limit when they are unpacked.
+LARGEST_CONTENT, SMALL_CONTENT, SPREAD = 1 << 30, 1 << 26, 10
+#: Bytes that a reading counts: a text needs two to ten.
+READING = 4
+#: Longest line of a text, bytes; most columns of a table; most lines above its rows of numbers.
+LONGEST_LINE, MOST_COLUMNS, MOST_TITLES = 1 << 18, 2_000, 10_000
 
 
-def refuse_large(size: int, path: Path) -> None:
-    """Refuse a file with more than ``LARGEST_CONTENT`` bytes of readings.
+def largest(content: Content) -> int:
+    """Most bytes of text that the bytes of a file justify, or ``READING`` for each reading."""
+    own = len(content) if isinstance(content, bytes) else content.stat().st_size
+    return min(LARGEST_CONTENT, max(SMALL_CONTENT, SPREAD * own))
+
+
+def refuse_large(size: int, content: Content, path: Path) -> None:
+    """Refuse a file that unpacks to more bytes than its own justify.
+
+    Parameters
+    ----------
+    size : of what it holds: bytes of text, or ``READING`` for each reading
+    content : the bytes of the file, or where they lie
 
     Raises
     ------
     InputError
         Naming the size.
     """
-    if size > LARGEST_CONTENT:
+    most = largest(content)
+    if size > most:
         raise InputError(
-            f"a {path.suffix} file must hold at most {LARGEST_CONTENT >> 20} MiB, decompressed",
+            f"a {path.suffix} file of this size must hold at most {most >> 20} MiB, decompressed",
             f"{size >> 20} MiB",
-            "export a part of the record, or fewer channels",
+            "export a part of the record, or fewer channels, or text without compression",
             path,
         )
+
+
+def refuse_wide(columns: int, path: Path, line: int | None = None) -> None:
+    """Refuse a table with more than ``MOST_COLUMNS`` columns.
+
+    Raises
+    ------
+    InputError
+        Naming their number.
+    """
+    if columns > MOST_COLUMNS:
+        rule, remedy = f"a table must have at most {MOST_COLUMNS} columns", "export fewer channels, a row per sample"
+        raise InputError(rule, str(columns), remedy, path, line, line and 1)
 
 
 def require(package: str, path: Path) -> None:
@@ -92,7 +122,7 @@ def complete(path: Path, remedy: str) -> Iterator[None]:
 
 COMPRESSED = ".gz"
 #: Bytes of a block, and bytes that are decompressed at a time.
-BLOCK = 1 << 22
+BLOCK = 1 << 20
 WINDOWS = "Windows-1252"
 _CODECS = {"UTF-16": "utf-16", WINDOWS: "cp1252"}
 _NOT_WINDOWS = re.compile(rb"[\x81\x8d\x8f\x90\x9d]")
@@ -123,6 +153,22 @@ class TextFile:
             else raw.decode(_CODECS[self.encoding]).encode()
         )
         self._text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
+        self._refuse_long_line()
+
+    def _refuse_long_line(self) -> None:
+        """Refuse a line longer than ``LONGEST_LINE``, at its place."""
+        begin = 0
+        while begin + LONGEST_LINE < len(self._text):
+            end = self._text.rfind(b"\n", begin, begin + LONGEST_LINE + 1) + 1
+            if not end:
+                rule, remedy = f"a line must have at most {LONGEST_LINE} bytes", "export a row per sample, in lines"
+                raise InputError(rule, "a longer one", remedy, self.path, self._text.count(b"\n", 0, begin) + 1, 1)
+            begin = end
+
+    def has_cell(self, text: str) -> bool:
+        """Whether a text stands between any two separators, or at the beginning or the end of a line."""
+        pattern = rb'(?:^|[,;\t ])"?%s"?(?:$|[,;\t ])' % re.escape(text.encode())
+        return re.search(pattern, self._text.rstrip(b"\n"), re.MULTILINE) is not None
 
     def blocks(self, first: int = 0) -> Iterator[tuple[int, bytes]]:
         """Blocks of lines from line ``first``, counted from 0: the number of their first line, and their text in UTF-8.
@@ -158,15 +204,15 @@ def _bytes_of(content: Content, path: Path) -> bytes:
     """The bytes of a text, decompressed."""
     if path.suffix.lower() != COMPRESSED:
         return whole(content)
-    found = bytearray()
+    found, size = list[bytes](), 0
     with gzip.open(io.BytesIO(content) if isinstance(content, bytes) else content) as file:
         while True:
             with complete(path, "compress it again by gzip"):
-                chunk = file.read(BLOCK)
-            refuse_large(len(found) + len(chunk), path)
-            if not chunk:
-                return bytes(found)
-            found += chunk
+                found.append(file.read(BLOCK))
+            size += len(found[-1])
+            refuse_large(size, content, path)
+            if not found[-1]:
+                return b"".join(found)
 
 
 def _encoding(raw: bytes, path: Path) -> str:
@@ -182,11 +228,15 @@ def _encoding(raw: bytes, path: Path) -> str:
     if not marked and (nul := raw.find(b"\0")) >= 0:
         raise InputError(rule, *binary, path, *place_of_byte(raw[:nul], "utf-8"))
     codec = "utf-16" if marked else "utf-8"
-    try:
-        raw.decode(codec)
-    except UnicodeDecodeError as error:
-        fault = error.start
-    else:
+    decoder, fault = codecs.getincrementaldecoder(codec)(), None
+    for begin in range(0, len(raw), BLOCK):  # a text as a whole may take four times its bytes
+        try:
+            decoder.decode(raw[begin : begin + BLOCK], begin + BLOCK >= len(raw))
+        except UnicodeDecodeError as error:
+            # The decoder keeps an incomplete character of the block before.
+            fault = min(begin + BLOCK, len(raw)) - len(error.object) + error.start
+            break
+    if fault is None:
         return "UTF-16" if marked else "UTF-8"
     if marked:
         raise InputError(rule, "damaged UTF-16", "save it as UTF-8", path, *place_of_byte(raw[:fault], codec))
@@ -362,6 +412,7 @@ def export_of_arrays(
                 own = {name + form.format(i + 1): one for i, one in enumerate(array if rows else array.T)}
             columns |= own
             stated += [(units or {}).get(name, "")] * len(own)
+    refuse_wide(len(columns), path)
     if not columns:
         raise InputError(
             f"a {path.suffix} file must hold real numeric vectors", "none", "export the readings as vectors", path

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Content, Place, RawTable, TextFile, lines_of, occurrences
+from capsule_id.rig.formats.raw import Content, Place, RawTable, TextFile, lines_of, occurrences, refuse_wide
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -41,6 +41,13 @@ def cells_of(line: str, delimiter: str | None) -> list[tuple[str, int]]:
         cells.append((bare, start + (len(cell) - len(cell.lstrip(BLANKS)) if bare else 0) + 1))
         start += len(cell) + 1
     return cells
+
+
+def texts_of(line: str, delimiter: str | None) -> list[str]:
+    """The cells of a line without their places, as ``cells_of``."""
+    if delimiter is None:
+        return re.findall(rf"[^{BLANKS}]+", line)
+    return [cell.strip(BLANKS) for cell in line.split(delimiter)]
 
 
 def place_of_cell(line: str, delimiter: str | None, column: int, absent: int = 1) -> int:
@@ -121,12 +128,13 @@ def read_column(
         At the first cell that is neither a finite number nor a marker.
     """
     mark = decimal or decimal_mark(texts, missing) or "."
-    if (_NUMBER_CHARACTERS | {mark}).issuperset("".join(texts)):  # quickly, where all are numbers
+    markers, values = frozenset(missing), np.full(len(texts), np.nan)
+    used = [k for k, text in enumerate(texts) if text not in markers] if missing else range(len(texts))
+    if (_NUMBER_CHARACTERS | {mark}).issuperset("".join([texts[k] for k in used])):  # quickly, where all are numbers
         with suppress(ValueError):
-            values = np.array([float(text.replace(mark, ".")) for text in texts])
-            if np.isfinite(values).all():
+            values[used] = [float(texts[k].replace(mark, ".")) for k in used]
+            if np.isfinite(values[used]).all():
                 return values
-    values = np.full(len(texts), np.nan)
     for k, text in enumerate(texts):
         if text in missing:
             continue
@@ -195,7 +203,7 @@ class Rows:
     @property
     def lines(self) -> np.ndarray:
         """(rows,) 1-based line of every row."""
-        return np.concatenate([np.empty(0, int), *self.blocks])
+        return np.concatenate([np.empty(0, np.int32), *self.blocks])
 
     def column(self, index: int) -> np.ndarray:
         """The numbers of a column, (rows,).
@@ -213,8 +221,8 @@ class Rows:
         return np.concatenate(parts)
 
     def words(self, index: int) -> np.ndarray:
-        """The texts of a column, (rows,)."""
-        return np.array(self.texts[index])
+        """The texts of a column, (rows,), as objects: one long text must not widen all."""
+        return np.array(self.texts[index], dtype=object)
 
 
 def is_comment(line: str) -> bool:
@@ -292,7 +300,7 @@ def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | N
                 values = plain_block("\n".join([*lines, ""]).encode(), shape, columns)
         if values is None:
             return None
-        rows.blocks.append(np.asarray(numbers, int) + 1)
+        rows.blocks.append(np.asarray(numbers, np.int32) + 1)
         for index, column in enumerate(columns):
             rows.numbers[column].append(values[:, index])
     return rows
@@ -323,7 +331,7 @@ def any_rows(
     for number, text in file.blocks(shape.first):
         kept = list(_rows_in(number, text))
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
-        rows.blocks.append(np.array([line for line, _ in kept], int) + 1)
+        rows.blocks.append(np.array([line for line, _ in kept], np.int32) + 1)
         for column in columns:
             texts = [bare(row[column]) for row in cells]
             if column in words:
@@ -348,7 +356,7 @@ def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:
 
 def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
     """The cells of a row, as many as the first row has."""
-    cells = [cell for cell, _ in cells_of(text, shape.delimiter)]
+    cells = texts_of(text, shape.delimiter)
     cells = cells[:-1] if shape.trailing else cells
     if len(cells) != shape.width:
         raise InputError(
@@ -403,6 +411,7 @@ def read_csv(content: Content, path: Path) -> RawTable:
     if not header.strip():
         _refuse_blank(file)
     delimiter = next((mark for mark in "\t;," if mark in header), ",")
+    refuse_wide(header.count(delimiter) + 1, path, 1)
     names, units = _header(header, delimiter, path)
     marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")

@@ -17,10 +17,9 @@ from pathlib import Path
 import atheris
 import numpy as np
 
-with atheris.instrument_imports(include=["capsule_id.rig", "nptdms", "openpyxl", "pyfive"]):
+with atheris.instrument_imports(include=["capsule_id.rig", "nptdms", "openpyxl"]):
     import nptdms  # noqa: F401  (imported here to be instrumented)
     import openpyxl  # noqa: F401
-    import pyfive  # noqa: F401
 
     from capsule_id.errors import InputError
     from capsule_id.rig.formats import EXPORTS, READERS

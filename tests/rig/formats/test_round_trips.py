@@ -111,9 +111,9 @@ def test_faults_of_a_labview_file(tmp_path: Path, fault: str, repaired: str, rul
         read(tmp_path, "run.lvm", text.encode(), "X_Value")
 
 
-@pytest.mark.parametrize("name", ["npTDMS", "openpyxl", "pyarrow", "pyfive"])
+@pytest.mark.parametrize("name", ["npTDMS", "openpyxl", "pyarrow"])
 def test_a_package_that_is_not_installed_is_named(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    suffix = {"npTDMS": ".tdms", "openpyxl": ".xlsx", "pyarrow": ".parquet", "pyfive": ".h5"}[name]
+    suffix = {"npTDMS": ".tdms", "openpyxl": ".xlsx", "pyarrow": ".parquet"}[name]
     monkeypatch.setitem(sys.modules, name.lower(), None)
     with pytest.raises(InputError, match=rf"needs the package {name}, not installed, run pip install"):
         read(tmp_path, f"run{suffix}", b"any", "time")
