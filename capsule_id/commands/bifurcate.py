@@ -3,7 +3,6 @@
 import argparse
 import logging
 import shutil
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -20,10 +19,10 @@ from capsule_id.commands.capsule_options import (
     number,
 )
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
-from capsule_id.console import Progress, say
+from capsule_id.console import Progress, complain, saved, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
-from capsule_id.output import PARTIAL, check_parents
+from capsule_id.output import NEW, PARTIAL, check_parents, write_file
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
@@ -82,14 +81,15 @@ def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
         If they cannot be written.
     """
     from capsule_id.report.figures.style import png
+    from capsule_id.report.netcdf import netcdf_bytes
 
     files = out, out.with_suffix(".png")
-    new = [path.with_name(f".{path.name}.new") for path in files]
+    new = [path.with_name(f".{path.name}{NEW}") for path in files]
     try:
         with refusing("the output must be writable", "choose another --out", out):
             out.parent.mkdir(parents=True, exist_ok=True)
-            data.to_netcdf(new[0], engine="h5netcdf")
-            new[1].write_bytes(png(figure))
+            for path, content in zip(new, (netcdf_bytes(data), png(figure)), strict=True):
+                write_file(path, content)
             for path, file in zip(new, files, strict=True):
                 path.replace(file)
     finally:
@@ -246,6 +246,7 @@ def run(args: argparse.Namespace) -> int:
         measured = _measured_points(args, rig, axes, values) if rig is not None else ()
         with own_style():
             publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+    saved.clear()
     shutil.rmtree(store, ignore_errors=True)
     say(_summary_text(data, axes, out))
     return 0
@@ -324,7 +325,7 @@ def _measured_points(
     by_name = args.spring if args.k2 is None else None
     span = Span(axes[0].name, x[0], x[-1])
     motions, sentence = overlay(rig, span, values, fitted_values(args.result), by_name)
-    print(sentence, file=sys.stderr, flush=True)
+    complain(sentence)
     return motions
 
 

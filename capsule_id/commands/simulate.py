@@ -2,14 +2,15 @@
 
 import argparse
 import math
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_and_drive, capsule_values, number
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
+from capsule_id.console import complain, say
 from capsule_id.errors import InputError, refusing
+from capsule_id.output import replace_file
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     if not status.usable:
         raise InputError("the run must be complete", status.name, status_message(t.status))
     if status is not Status.OK:
-        print(f"capsule-id simulate: {status_message(t.status)}", file=sys.stderr)
+        complain(f"capsule-id simulate: {status_message(t.status)}")
     warn_of_far_gap(p.G, t.x_rel)
     held = np.isin(times, grid)
     columns = {"time": times[held]} | {name: np.asarray(getattr(t, name))[held] for name in (*STATE, "x_rel")}
@@ -91,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         with refusing("the output must be writable", "choose another name", args.figure):
             _draw(args.figure, t, np.isin(times, section), values["G"])
     events = f"{counted(int(t.contacts), 'contact')}, {counted(int(t.events), 'event')}"
-    print(f"wrote {args.out}: {counted(samples, 'sample')} of {end:g} s, {events}")
+    say(f"wrote {args.out}: {counted(samples, 'sample')} of {end:g} s, {events}")
     return 0
 
 
@@ -143,7 +144,7 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
     view = MotionView(np.asarray(t.times), channels, x_rel, rate, x_rel[section], rate[section], G)
     with own_style():
         overview(view, figure := new_figure(10.0, 4.8))
-        path.write_bytes(png(figure))
+        replace_file(path, png(figure))
 
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:

@@ -3,6 +3,7 @@
 A tree of frozen dataclasses becomes JSON; its arrays are saved beside it. The draws stay in ``posterior.nc``.
 """
 
+import io
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -26,8 +27,8 @@ READ_ERRORS = (OSError, KeyError, ValueError, TypeError, AttributeError, ImportE
 _TREE = "tree"
 
 
-def save(result: Result, directory: Path) -> None:
-    """Write ``SAVED`` into ``directory``, which has a folder ``figures``. The registry is not saved."""
+def saved_bytes(result: Result) -> bytes:
+    """The content of ``SAVED``. The registry is not saved."""
     posterior = result.posterior
     if posterior is not None:
         posterior = replace(posterior, draws=np.zeros(0), lp=np.zeros(0))
@@ -36,14 +37,15 @@ def save(result: Result, directory: Path) -> None:
     kept = {field.name: getattr(light, field.name) for field in fields(Result) if field.name != "registry"}
     text = json.dumps(_encode(kept, arrays)).encode("utf-8")
     arrays[_TREE] = np.frombuffer(text, np.uint8)
-    with zipfile.ZipFile(directory / SAVED, "w", zipfile.ZIP_DEFLATED) as file:
+    with zipfile.ZipFile(content := io.BytesIO(), "w", zipfile.ZIP_DEFLATED) as file:
         for name, values in arrays.items():
             with file.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, values, allow_pickle=False)
+    return content.getvalue()
 
 
 def load(directory: Path, registry: Registry) -> dict[str, Any]:
-    """The fields of the ``Result`` that ``save`` and ``write_posterior`` wrote into ``directory``.
+    """The fields of the ``Result`` that ``write_result`` wrote into ``directory``.
 
     Raises
     ------
