@@ -97,8 +97,8 @@ def read_sample(path: Path, saved: Posterior) -> tuple[Posterior, dict[str, np.n
 
     Raises
     ------
-    OSError, KeyError, ValueError
-        If the file is absent, damaged, or another fit wrote it.
+    Exception
+        Of any kind, if the file is absent, damaged, or another fit wrote it.
     """
     with xr.open_datatree(path, engine="h5netcdf") as tree:
         tree.load()
@@ -233,7 +233,7 @@ def read_draws(path: Path, count: int, seed: int) -> dict[str, np.ndarray]:
         with xr.open_dataset(path, group="posterior", engine="h5netcdf") as data:
             size = data.sizes["chain"] * data.sizes["draw"]
             columns = _members_of(data)
-    except (OSError, KeyError, ValueError) as error:
+    except Exception as error:  # a damaged file raises any
         rule, remedy = "--posterior takes the posterior.nc of a result", "give results/<rig>/posterior.nc"
         raise InputError(rule, type(error).__name__, remedy, path) from None
     if not 1 <= count <= size:

@@ -33,9 +33,9 @@ def result_files(result: Result) -> dict[str, bytes]:
         "parameters.csv": table_frame(result).to_csv(lineterminator="\n"),
         "parameters.json": text,
     }
-    files = {f"figures/{picture.name}.png": picture.png for picture in drawn} | {SAVED.as_posix(): saved_bytes(result)}
-    if result.posterior is not None:
-        files[SAMPLE] = netcdf_bytes(data_tree(result))
+    sample = b"" if result.posterior is None else netcdf_bytes(data_tree(result))
+    files = {f"figures/{picture.name}.png": picture.png for picture in drawn}
+    files |= {SAVED.as_posix(): saved_bytes(result, sample)} | ({SAMPLE: sample} if sample else {})
     return files | {name: as_utf8(text) for name, text in texts.items()}
 
 
