@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 
 STORE_FILE = "points.json"  # in every store, see motions/sweep.py
+# A kill may leave a store without it, or a new file of any name.
+_STORED = re.compile(rf"(block_[0-9]+\.npz|{re.escape(STORE_FILE)})({re.escape(NEW)})?")
 
 
 def prepare_store(out: Path, resume: bool) -> Path:
@@ -65,7 +68,7 @@ def prepare_store(out: Path, resume: bool) -> Path:
     if resume and not (store / STORE_FILE).is_file():
         raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", store)
     if store.exists() and not resume:
-        if not store.is_dir() or (any(store.iterdir()) and not (store / STORE_FILE).exists()):
+        if not store.is_dir() or not all(_STORED.fullmatch(path.name) for path in store.iterdir()):
             rule, remedy = "FILE.nc.partial must be unfinished work", "choose another --out"
             raise InputError(rule, "it is something else", remedy, store)
         shutil.rmtree(store)

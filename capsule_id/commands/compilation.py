@@ -7,6 +7,7 @@ import argparse
 import hashlib
 import os
 import platform
+import re
 import shutil
 import sys
 from contextlib import suppress
@@ -91,7 +92,8 @@ def leave_cache(message: str) -> str:
     """
     if not message.startswith(CACHE_ERRORS) or DIRECTORY not in os.environ:
         return message
-    refused, own = "[Errno" in message, Path(os.environ[DIRECTORY]) == cache_directory()
+    refused = re.search(r"\[Errno|NotImplementedError|Timeout", message) is not None  # or the folder has no locks
+    own = Path(os.environ[DIRECTORY]) == cache_directory()
     if own and not (refused and message.startswith(CACHE_ERRORS[0])):  # a full disk leaves a part of a program
         shutil.rmtree(cache_directory(), ignore_errors=True)
     if refused:

@@ -285,6 +285,20 @@ def test_a_damaged_state_is_refused_or_begun_afresh(here: Path, damage: str | No
     assert {path.name for path in here.iterdir()} == {"rig", "out"}
 
 
+def test_resume_is_promised_where_something_is_saved(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``test_cli_resume`` holds the other half."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("capsule_id.commands.rigs.make_experiments", interrupted)
+    assert fit_params(["rig", "--no-sample", "--out", "out"]) == 130
+    assert capsys.readouterr().err == "fit-params: interrupted\n"
+    assert {path.name for path in here.iterdir()} == {"rig"}
+
+
 def test_resume_needs_something_to_resume(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = listing(here)
     assert fit_params(["rig", "--resume"]) == 2
