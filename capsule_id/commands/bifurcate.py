@@ -5,7 +5,7 @@ import logging
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,7 +71,8 @@ def prepare_store(out: Path, resume: bool) -> Path:
         if not store.is_dir() or not all(_STORED.fullmatch(path.name) for path in store.iterdir()):
             rule, remedy = "FILE.nc.partial must be unfinished work", "choose another --out"
             raise InputError(rule, "it is something else", remedy, store)
-        shutil.rmtree(store)
+        with refusing("FILE.nc.partial must be writable", "choose another --out", store):
+            shutil.rmtree(store)
     return store
 
 
@@ -97,7 +98,8 @@ def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
                 path.replace(file)
     finally:
         for path in new:
-            path.unlink(missing_ok=True)
+            with suppress(OSError):
+                path.unlink()
 
 
 # cluster: A Dask cluster for the blocks of a map or for rigs: threads or processes of this machine, or a running

@@ -119,15 +119,15 @@ OLD_FILES = ("parameters.json", "parameters.csv", "posterior.nc", "report.html",
 OLD_FILES += tuple(f"figures/{letter}.png" for letter in "abcdefg")
 
 
-def whole_run(directory: Path, mark: str, resume: bool = False, error: Exception | None = None) -> None:
+def whole_run(directory: Path, mark: str, resume: bool = False, error: BaseException | None = None) -> None:
     """All file operations of ``fit-params`` without the fit; every file says ``mark``."""
     check_directory(directory)
     with work_in_progress(directory, {"seed": 0}, resume) as partial:
         replace_file(partial / CHAINS, mark)
-        if error is not None:
-            raise error
         text = json.dumps({"mark": mark, "provenance": {"versions": {"capsule-id": "0"}}})
         write_result(dict.fromkeys(OLD_FILES, mark.encode()) | {"parameters.json": text.encode()}, partial)
+        if error is not None:
+            raise error
         publish(partial, directory)
 
 
@@ -180,6 +180,8 @@ def test_a_kill_at_any_operation(tmp_path: Path, old: bool, ends: str) -> None:
         directory = tmp_path / str(moment) / "out"
         if old:
             whole_run(directory, "old")
+        with suppress(KeyboardInterrupt):
+            whole_run(directory, "stopped", error=KeyboardInterrupt())
         killed = ended_at(moment, directory, "new")
         assert mark_of(directory) in ("old", "new", None)
         if old and not directory.exists():
