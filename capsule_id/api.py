@@ -50,7 +50,7 @@ from capsule_id.report.html import summary_html
 from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.netcdf import data_tree
 from capsule_id.report.saved import load as load_fields
-from capsule_id.report.write import table_frame, write_result
+from capsule_id.report.write import result_files, table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding, Level, ResultTable
@@ -263,7 +263,7 @@ class Fit(Result):
         path = Path(directory)
         check_directory(path)
         with work_in_progress(path, {}, resume=False) as partial:
-            write_result(self, partial)
+            write_result(result_files(self), partial)
             publish(partial, path)
 
 
@@ -383,7 +383,7 @@ def fit(
     seed : the same seed gives the same numbers
     experiments : "bench", "runs" or "all"
     budget : emcee steps of an ensemble after burn-in; None for the point fit alone
-    store : HDF5 file for the chains while they run; the draws in its saved copy are taken up
+    store : file for a copy of the chains every few seconds; a later call goes on from the draws in it
     progress : called with (draws done, draws until the next check, the stage); True or False: shown or not, by default
         on a terminal and in a notebook
     registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages

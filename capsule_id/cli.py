@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from capsule_id import console
-from capsule_id.commands.compilation import discard_damaged, use_one_blas_thread
+from capsule_id.commands.compilation import leave_cache, use_one_blas_thread
 from capsule_id.console import INTERRUPTED, end_interrupted, interruptible
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, OutputError
 
 BAD_INPUT, INTERNAL = 2, 1
-_RESUME = "; --resume continues the fit of one rig from the saved state"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -81,8 +80,8 @@ def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
     """Parse and act. Every end gives an exit code and at most one line on standard error."""
     try:
         code = _act(program, make_parser, arguments)
-    except console.OutputError as error:
-        console.complain(f"{program}: {error}")
+    except OutputError as error:
+        console.complain(console.ending(f"{program}: {error}"))
         code = INTERNAL
     if arguments is None:  # the process ends with this command
         end_interrupted(code)
@@ -99,14 +98,14 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
     """
     console.prepare()
     use_one_blas_thread()
-    interrupted = f"{program}: interrupted{_RESUME if program == 'fit-params' else ''}"
+    interrupted = f"{program}: interrupted"
     try:
         # The parsers load NumPy: an interruption must count from before that.
         with warnings.catch_warnings(), interruptible(interrupted):
             args = make_parser(program).parse_args(arguments)
             warnings.showwarning = partial(_show_warning, program)
             return args.run(args)
-    except console.OutputError:
+    except OutputError:
         raise
     except SystemExit as stop:  # of the parser
         console.finish()
@@ -115,7 +114,7 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         console.complain(error)
         return BAD_INPUT
     except KeyboardInterrupt:
-        console.complain(interrupted)
+        console.complain(console.ending(interrupted))
         return INTERRUPTED
     except Exception as error:
         console.complain(f"{program}: internal failure: {console.one_line(error)}; {console.save_traceback(error)}")
@@ -133,7 +132,7 @@ def _show_warning(
 ) -> None:
     """Print a warning in one line on standard error. The signature is that of ``warnings.showwarning``."""
     place = f"{Path(filename).name}:{lineno}"
-    text = discard_damaged(str(message))
+    text = leave_cache(str(message))
     if text == str(message):
         text = f"{category.__name__}: {message} ({place})"
     console.complain(" ".join(f"{program}: warning: {text}".split()))

@@ -14,12 +14,13 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import chdir, contextmanager, suppress
 from importlib import import_module
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from capsule_id.errors import printable
+from capsule_id.errors import OutputError, printable
 
 # interruption: Interruptions by Ctrl-C or SIGTERM: the handler sets a flag, long computations read it between their
 # steps.
@@ -37,6 +38,13 @@ _flag = threading.Event()
 #: ``left``: the event of the ``threads`` block that this thread works for.
 _worker = threading.local()
 _arrivals: list[float] = []
+#: Set while ``--resume`` can continue what this command does.
+saved = threading.Event()
+
+
+def ending(message: str) -> str:
+    """``message`` of a command that ends early, and whether ``--resume`` continues."""
+    return f"{message}{'; --resume continues from the saved state' if saved.is_set() else ''}"
 
 
 def stop_if_interrupted() -> None:
@@ -129,7 +137,7 @@ def _watch(receiver: socket.socket, ended: threading.Event, message: str) -> Non
             # The handler would be late: Python calls it after a compilation.
             _arrivals.append(time.monotonic())
             if not ended.wait(GRACE):
-                os.write(2, f"{message}\n".encode())  # sys.stderr may be locked by the main thread
+                os.write(2, f"{ending(message)}\n".encode())  # sys.stderr may be locked by the main thread
                 os._exit(INTERRUPTED)
             return
 
@@ -158,6 +166,12 @@ def prepare() -> None:
     if not logging.getLogger().handlers:  # else a library's log goes to standard error, as on a matplotlibrc
         logging.getLogger().addHandler(logging.NullHandler())
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's, as on a slow compilation
+    saved.clear()
+    if "matplotlib" not in sys.modules:  # its figures have a style and a backend of their own
+        os.environ |= {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
+        if Path("matplotlibrc").is_file():  # matplotlib reads it first, and ends where it is no UTF-8
+            with chdir(Path(__file__).parent):
+                import_module("matplotlib")
 
 
 def say(text: str) -> None:
@@ -169,8 +183,9 @@ def say(text: str) -> None:
 
 
 def complain(text: object) -> None:
-    """Print to standard error and flush."""
-    print(printable(str(text)), file=sys.stderr, flush=True)
+    """Print to standard error and flush; a stream that takes no more is no error."""
+    with suppress(OSError):
+        print(printable(str(text)), file=sys.stderr, flush=True)
 
 
 def finish() -> None:
@@ -179,10 +194,6 @@ def finish() -> None:
         sys.stdout.flush()
     except OSError as error:
         _discard(error)
-
-
-class OutputError(Exception):
-    """Standard output takes no more text, for instance on a full disk. The message is one line."""
 
 
 def _discard(error: OSError) -> None:
@@ -287,5 +298,6 @@ class Progress:
 
     def _end_line(self) -> None:
         if self._open and self._enabled:
-            sys.stderr.write("\n")
+            with suppress(OSError):
+                sys.stderr.write("\n")
             self._open = False

@@ -1,6 +1,9 @@
-"""The exceptions for bad input; they name place, rule, value and remedy."""
+"""The exceptions for bad input and for output without space; they name place, reason and remedy."""
 
+import errno
 import json
+import os
+import shutil
 import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -75,13 +78,50 @@ def check_seed(seed: int) -> None:
         raise InputError("--seed must not be negative", str(seed), "give 0 or more")
 
 
+class OutputError(OSError):
+    """A folder, a file or standard output takes no more. A command prints it in one line and returns exit code 1."""
+
+
+#: No space on the disk, a file beyond its limit, or a full quota.
+_FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+
+
+@contextmanager
+def writing(path: Path, needed: int = 0) -> Iterator[None]:
+    """Raise ``OutputError`` where the operating system refuses what the body writes into ``path``, a folder or a file.
+
+    needed : bytes that are still to be written, as far as known
+    """
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise _refused(path, error, needed) from error
+
+
+def _refused(path: Path, error: OSError, needed: int) -> OutputError:
+    """The error of a write: names the folder and, on a full disk, the space that is needed and left."""
+    folder = path if os.path.isdir(path) else path.parent  # noqa: PTH112 (Path raises without permission)
+    text, choice = f"{folder} cannot be written: {error.strerror or error}", "choose another folder"
+    if error.errno in _FULL:
+        there = next(part for part in (folder, *folder.absolute().parents) if part.exists())
+        text += f"; at least {needed / 1e6:.2f} MB are needed" if needed else ""
+        text += f"; {shutil.disk_usage(there).free / 1e6:.2f} MB are left"
+        choice = f"make space, or {choice}"
+    return OutputError(" ".join(f"{text}; {choice}".split()))
+
+
 @contextmanager
 def refusing(rule: str, remedy: str, file: str | Path = "") -> Iterator[None]:
-    """Raise ``InputError`` where the operating system refuses what the body does."""
+    """Raise ``InputError`` where the operating system refuses what the body does, ``OutputError`` on a full disk."""
     try:
         yield
     except OSError as error:
-        raise InputError(rule, str(error.strerror or error), remedy, file) from None
+        cause = error.__cause__ if isinstance(error.__cause__, OSError) else error  # of an OutputError
+        if cause.errno in _FULL:
+            raise error if isinstance(error, OutputError) else _refused(Path(file), error, 0) from error
+        raise InputError(rule, str(cause.strerror or cause), remedy, file) from None
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Output directories: an unfinished result is ``DIR.partial``; one rename makes it ``DIR``."""
+"""Files and directories of results: an unfinished result is ``DIR.partial``; one rename makes it ``DIR``."""
 
 import errno
 import json
@@ -11,17 +11,57 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from capsule_id.errors import InputError, refusing
+from capsule_id.errors import InputError, OutputError, refusing, writing
 
 #: Files of a result directory. A directory with another file is never replaced.
 RESULT_FILES = frozenset({"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"})
-STATE, CHAINS = "state.json", "chains.h5"
+STATE, CHAINS, NEW = "state.json", "chains.saved", ".new"
 #: Additional files of an unfinished run.
-WORK_FILES = frozenset({STATE, "state.new", CHAINS, "chains.saved", "chains.saved-new"})
+WORK_FILES = frozenset({STATE, STATE + NEW, CHAINS, CHAINS + NEW})
 #: The lock stands beside ``DIR.partial``: Windows renames no directory with an open file.
 PARTIAL, OLD, LOCK = ".partial", ".partial.old", ".partial.lock"
 _writable = partial(refusing, "the output directory must be writable", "choose another --out")
 _WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)  # a file system without locks
+
+
+def as_utf8(text: str) -> bytes:
+    """A text for a file. Names of files that are no text, as the operating system allows them, show question marks."""
+    return text.encode("utf-8", "replace")
+
+
+def write_file(path: Path, content: bytes | str, needed: int = 0) -> None:
+    """Write a file, text as UTF-8.
+
+    needed : bytes that are still to be written with this file, where there are more
+
+    Raises
+    ------
+    OutputError
+        If the operating system refuses.
+    """
+    content = content if isinstance(content, bytes) else as_utf8(content)
+    with writing(path, max(needed, len(content))):
+        path.write_bytes(content)
+
+
+def replace_file(path: Path, content: bytes | str, needed: int = 0) -> None:
+    """Write a file beside ``path`` and rename it: whenever the process ends, the old or the new one is complete.
+
+    Raises
+    ------
+    OutputError
+        As ``write_file``.
+    """
+    path = Path(os.path.realpath(path))  # a link stays
+    new = path.with_name(path.name + NEW)
+    try:
+        write_file(new, content, needed)
+        with writing(path):
+            new.replace(path)
+    except OutputError:
+        with suppress(OSError):
+            new.unlink()
+        raise
 
 
 def partial_directory(directory: Path) -> Path:
@@ -43,12 +83,16 @@ def check_directory(directory: Path) -> None:
         named = f"the output directory must have a name, which must not end in {PARTIAL}, {OLD} or {LOCK}"
         raise InputError(named, f"'{directory}'", remedy)
     with refusing("the output directory must be usable", remedy, directory):
+        _check_unfinished(directory, resume=False)
+        if _old(directory).exists():  # what holds a sample must not be hidden from the caller's checks
+            with _locked(directory):
+                _recover(directory)
         names = _names_in(directory, rule, remedy)
-        check_parents(directory, "the output directory must be writable", directory)
+        for place in (directory / "parameters.json", directory / "figures" / "data.npz"):
+            check_parents(place, "the output directory must be writable", directory)
     if names and not _is_result(directory):
         foreign = sorted(names - RESULT_FILES - WORK_FILES)
         raise InputError(rule, f"it holds {foreign[0]}" if foreign else "it is not one", remedy, directory)
-    _check_unfinished(directory, resume=False)
 
 
 def check_parents(path: Path, rule: str, place: str | Path) -> None:
@@ -98,21 +142,20 @@ def work_in_progress(directory: Path, fingerprint: Mapping[str, object], resume:
         new = not partial.exists()
         try:
             _check_unfinished(directory, resume)
-            with _writable(partial):
-                partial.mkdir(exist_ok=True)
-            _recover(directory)
             if resume:
                 _check_fingerprint(partial, fingerprint)
-            else:
-                for path in partial.iterdir():
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
-            text = json.dumps({"fingerprint": dict(fingerprint)}, indent=1)
-            (partial / "state.new").write_text(text, encoding="utf-8", newline="\n")
-            (partial / "state.new").replace(partial / STATE)
+            with _writable(partial):
+                _recover(directory)
+                partial.mkdir(exist_ok=True)
+                if not resume:
+                    _clear(partial)
+            replace_file(partial / STATE, json.dumps({"fingerprint": dict(fingerprint)}, indent=1))
             yield partial
         except InputError:
             if new:
-                shutil.rmtree(partial, ignore_errors=True)
+                with suppress(OSError):
+                    _clear(partial)
+                    shutil.rmtree(partial)
             raise
 
 
@@ -135,7 +178,7 @@ def _locked(directory: Path) -> Iterator[None]:
         yield
     finally:
         if lock.is_locked:
-            with suppress(PermissionError):  # Windows removes an open file only with the release
+            with suppress(OSError):  # Windows removes an open file only with the release
                 Path(lock.lock_file).unlink(missing_ok=True)
         lock.release()
         for path in missing:
@@ -148,7 +191,7 @@ def _check_unfinished(directory: Path, resume: bool) -> None:
 
     An older result lies there while it is replaced.
     """
-    partial, old = partial_directory(directory), directory.with_name(directory.name + OLD)
+    partial, old = partial_directory(directory), _old(directory)
     rule, remedy = "DIR.partial must be unfinished work", "move it away or choose another --out"
     with _writable(partial):
         if resume and not partial.exists():
@@ -157,17 +200,32 @@ def _check_unfinished(directory: Path, resume: bool) -> None:
         foreign = sorted(names - RESULT_FILES - WORK_FILES)
         if foreign or (names and not names & WORK_FILES):
             raise InputError(rule, f"it holds {(foreign or sorted(names))[0]}", remedy, partial)
-        if old.is_symlink() or (old.exists() and not (old.is_dir() and _is_result(old))):
+        if _names_in(old, "DIR.partial.old must be an older result", "move it away") - RESULT_FILES - WORK_FILES:
             raise InputError("DIR.partial.old must be an older result", "it is something else", "move it away", old)
 
 
+def _old(directory: Path) -> Path:
+    """Where an older result lies while it is replaced and removed."""
+    return directory.with_name(directory.name + OLD)
+
+
 def _recover(directory: Path) -> None:
-    """Restore or remove the older result if a run died during its replacement."""
-    old = directory.with_name(directory.name + OLD)
-    if old.exists() and directory.exists():
-        shutil.rmtree(old)
-    elif old.exists():
+    """Restore the older result if a run died during its replacement; remove what is left of it after that."""
+    old = _old(directory)
+    if not old.exists():
+        return
+    if directory.exists() or not _is_result(old):
+        with refusing("an older result must be removable", "move it away", old):
+            shutil.rmtree(old)
+    else:
         old.rename(directory)
+
+
+def _clear(partial: Path) -> None:
+    """Remove what ``partial`` holds but its state: without one it would not show whose it is."""
+    for path in partial.iterdir():
+        if path.name != STATE:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _check_fingerprint(partial: Path, fingerprint: Mapping[str, object]) -> None:
@@ -189,10 +247,15 @@ def publish(partial: Path, directory: Path) -> None:
 
     The work files are removed after the rename, so that a run can resume until then.
     """
-    old = directory.with_name(directory.name + OLD)
-    if directory.exists():
-        directory.rename(old)
-    partial.rename(directory)
+    with writing(directory):
+        try:
+            if directory.exists():
+                directory.rename(_old(directory))
+            partial.rename(directory)
+        except OSError:
+            _recover(directory)
+            raise
     for name in WORK_FILES:
-        (directory / name).unlink(missing_ok=True)
-    shutil.rmtree(old, ignore_errors=True)
+        with suppress(OSError):
+            (directory / name).unlink()
+    shutil.rmtree(_old(directory), ignore_errors=True)

@@ -4,7 +4,10 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
@@ -59,6 +62,45 @@ def small_rig(folder: Path, name: str = "small", tables: tuple[str, ...] = ("sta
         shutil.copy(DATA / f"{table}.csv", folder)
     (folder / "rig.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
+
+
+class Killed(BaseException):
+    """Simulates a kill: no handler catches it."""
+
+
+_fault: list[Callable[[str, tuple[Any, ...]], None]] = []
+#: Operations on files that change the disk, as Python reports them.
+_CHANGES = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.symlink", "os.link"}
+
+
+def _audit(event: str, details: tuple[Any, ...]) -> None:
+    if _fault:
+        _fault[0](event, details)
+
+
+sys.addaudithook(_audit)
+
+
+@contextmanager
+def failing(error: Callable[[], BaseException], first: int, end: int | None = None) -> Iterator[list[str]]:
+    """Raise ``error`` instead of the operations on files from number ``first`` on, before number ``end``.
+
+    Yields the list of the operations: every opened file, renaming, removal, new folder.
+    """
+    operations = list[str]()
+
+    def fault(event: str, details: tuple[Any, ...]) -> None:
+        opened = event == "open" and bool(details[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
+        if (opened or event in _CHANGES) and isinstance(details[0], str | Path) and details[0] != os.devnull:
+            operations.append(f"{event} {details[0]}")
+            if first < len(operations) and (end is None or len(operations) <= end):
+                raise error()
+
+    _fault.append(fault)
+    try:
+        yield operations
+    finally:
+        _fault.clear()
 
 
 def same_result(one: Path, other: Path) -> None:

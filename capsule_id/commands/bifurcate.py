@@ -2,9 +2,10 @@
 
 import argparse
 import logging
+import re
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,10 +20,10 @@ from capsule_id.commands.capsule_options import (
     number,
 )
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
-from capsule_id.console import Progress, complain, say
+from capsule_id.console import Progress, complain, saved, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
-from capsule_id.output import PARTIAL, check_parents
+from capsule_id.output import NEW, PARTIAL, check_parents, write_file
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 
 STORE_FILE = "points.json"  # in every store, see motions/sweep.py
+# A kill may leave a store without it, or a new file of any name.
+_STORED = re.compile(rf"(block_[0-9]+\.npz|{re.escape(STORE_FILE)})({re.escape(NEW)})?")
 
 
 def prepare_store(out: Path, resume: bool) -> Path:
@@ -65,10 +68,11 @@ def prepare_store(out: Path, resume: bool) -> Path:
     if resume and not (store / STORE_FILE).is_file():
         raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", store)
     if store.exists() and not resume:
-        if not store.is_dir() or (any(store.iterdir()) and not (store / STORE_FILE).exists()):
+        if not store.is_dir() or not all(_STORED.fullmatch(path.name) for path in store.iterdir()):
             rule, remedy = "FILE.nc.partial must be unfinished work", "choose another --out"
             raise InputError(rule, "it is something else", remedy, store)
-        shutil.rmtree(store)
+        with refusing("FILE.nc.partial must be writable", "choose another --out", store):
+            shutil.rmtree(store)
     return store
 
 
@@ -81,19 +85,21 @@ def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
         If they cannot be written.
     """
     from capsule_id.report.figures.style import png
+    from capsule_id.report.netcdf import netcdf_bytes
 
     files = out, out.with_suffix(".png")
-    new = [path.with_name(f".{path.name}.new") for path in files]
+    new = [path.with_name(f".{path.name}{NEW}") for path in files]
     try:
         with refusing("the output must be writable", "choose another --out", out):
             out.parent.mkdir(parents=True, exist_ok=True)
-            data.to_netcdf(new[0], engine="h5netcdf")
-            new[1].write_bytes(png(figure))
+            for path, content in zip(new, (netcdf_bytes(data), png(figure)), strict=True):
+                write_file(path, content)
             for path, file in zip(new, files, strict=True):
                 path.replace(file)
     finally:
         for path in new:
-            path.unlink(missing_ok=True)
+            with suppress(OSError):
+                path.unlink()
 
 
 # cluster: A Dask cluster for the blocks of a map or for rigs: threads or processes of this machine, or a running
@@ -245,6 +251,7 @@ def run(args: argparse.Namespace) -> int:
         measured = _measured_points(args, rig, axes, values) if rig is not None else ()
         with own_style():
             publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+    saved.clear()
     shutil.rmtree(store, ignore_errors=True)
     say(_summary_text(data, axes, out))
     return 0

@@ -9,6 +9,7 @@ from capsule_id.errors import InputError, refusing
 from capsule_id.experiments import rough_values
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint, lint_settings
+from capsule_id.output import write_file
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Rig, Table
@@ -61,7 +62,7 @@ def _draw(rig: Rig, findings: Sequence[Finding], folder: Path) -> list[str]:
             figure = readings_figure(table, [found for found in findings if found.experiment == table.label])
             if rig.synthetic:
                 mark(figure, "SYNTHETIC")
-            (folder / f"{table.label}.png").write_bytes(png(figure))
+            write_file(folder / f"{table.label}.png", png(figure))
     return [f"figures: {len(rig.tables)} in {folder}"]
 
 

@@ -7,6 +7,7 @@ import argparse
 import hashlib
 import os
 import platform
+import re
 import shutil
 import sys
 from contextlib import suppress
@@ -27,8 +28,9 @@ BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 WORTH_KEEPING = 0.3
 #: Largest size of the cache, bytes; JAX removes the programs that were not used for the longest time.
 LARGEST_CACHE = 256 * 2**20
-#: Variable of JAX with the directory of the cache, and how JAX's warning about a damaged program begins.
-DIRECTORY, DAMAGED = "JAX_COMPILATION_CACHE_DIR", "Error reading persistent compilation cache entry"
+#: Variable of JAX with the directory of the cache, and how JAX's warnings about the cache begin.
+DIRECTORY = "JAX_COMPILATION_CACHE_DIR"
+CACHE_ERRORS = tuple(f"Error {doing} persistent compilation cache entry" for doing in ("reading", "writing"))
 
 
 def use_one_blas_thread() -> None:
@@ -83,11 +85,23 @@ def cache_directory() -> Path:
     return user_cache_path("capsule-id", appauthor=False) / f"jax-{version('jax')}-{version('jaxlib')}-{key}"
 
 
-def discard_damaged(message: str) -> str:
-    """Remove the cache if ``message``, a warning, is JAX's about a damaged program; return the text to print."""
-    if not message.startswith(DAMAGED) or DIRECTORY not in os.environ:
+def leave_cache(message: str) -> str:
+    """The text to print of ``message``, a warning; one of JAX about its cache ends the use of what is faulty.
+
+    A damaged cache is removed, and a cache that the operating system refuses is not used any more.
+    """
+    if not message.startswith(CACHE_ERRORS) or DIRECTORY not in os.environ:
         return message
-    if Path(os.environ[DIRECTORY]) != cache_directory():
-        return message  # the user's own
-    shutil.rmtree(cache_directory(), ignore_errors=True)
-    return "the cache of compiled programs was damaged and is removed"
+    refused = re.search(r"\[Errno|NotImplementedError|Timeout", message) is not None  # or the folder has no locks
+    own = Path(os.environ[DIRECTORY]) == cache_directory()
+    if own and not (refused and message.startswith(CACHE_ERRORS[0])):  # a full disk leaves a part of a program
+        shutil.rmtree(cache_directory(), ignore_errors=True)
+    if refused:
+        from jax import config
+        from jax.experimental.compilation_cache import compilation_cache
+
+        config.update("jax_enable_compilation_cache", val=False)
+        compilation_cache.reset_cache()
+        reason = message.partition("': ")[2]
+        return f"the cache of compiled programs cannot be used ({reason}); this command compiles them anew"
+    return "the cache of compiled programs was damaged and is removed" if own else message

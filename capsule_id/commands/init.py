@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from capsule_id.console import say
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.importing import entry_of, read_file
 from capsule_id.rig.toml import NAME_PATTERN
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     if len(contents) < len(files):
         raise InputError("files must have different names", "two of one name", "rename one of them", folder)
     guesses = {path.name: entry_of(contents[path.name], path, path.name, kinds) for path in files}
-    try:
+    with refusing("DIR must be writable", "name another one", folder):
         own = {path.resolve() for path in files}
         if folder.exists() and (not folder.is_dir() or any(each.resolve() not in own for each in folder.iterdir())):
             raise InputError("DIR must be new or an empty folder", str(folder), "name another one", folder)
@@ -111,8 +111,6 @@ def run(args: argparse.Namespace) -> int:
         for file, content in contents.items():
             if (folder / file).resolve() not in own:
                 (folder / file).write_bytes(content)
-    except OSError as error:
-        raise InputError("DIR must be writable", str(error.strerror), "name another one", folder) from None
     if not files:
         say(
             f"wrote {folder / 'rig.toml'}: add tables, remove the `# ` of their entries, then run capsule-id check {folder}"

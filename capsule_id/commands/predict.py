@@ -6,6 +6,7 @@ from pathlib import Path
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import say
 from capsule_id.errors import InputError, check_seed, refusing
+from capsule_id.output import replace_file
 from capsule_id.views import counted
 
 
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
             written.append(("--figure", args.figure, png(side_by_side(made.panels))))
     for option, file, content in written:
         with refusing(f"{option} must be writable", "name another file", file):
-            file.write_bytes(content)
+            replace_file(file, content)
         say(f"wrote {file}: {counted(len(made.table), 'setting')}" if option == "--out" else f"wrote {file}")
     return 0
 

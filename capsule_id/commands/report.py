@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from capsule_id.console import say
+from capsule_id.console import one_line, say
 from capsule_id.errors import InputError
 
 
@@ -27,25 +27,35 @@ def run(args: argparse.Namespace) -> int:
     path = args.directory / "parameters.json"
     try:
         text = path.read_text(encoding="utf-8")
-        saved = json.loads(text)
-        findings, clean = saved["verdict"]["findings"], bool(saved["verdict"]["clean"])
-        rows = {name: _row(entry) for name, entry in saved["parameters"].items()}
-        trust = saved["trust"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        rule, remedy = "DIR must be a result of fit-params", "run fit-params first"
-        raise InputError(rule, type(error).__name__, remedy, path) from error
-    if args.json:
-        say(text.rstrip())
-        return 0 if clean else 3
+        shown, clean = _shown(json.loads(text))
+    except Exception as error:  # a damaged file raises any
+        rule = "DIR must be a result of fit-params"
+        remedy = "run fit-params again" if path.is_file() else "run fit-params first"
+        raise InputError(rule, one_line(error), remedy, path) from error
+    say(text.rstrip() if args.json else shown)
+    return 0 if clean else 3
+
+
+def _shown(saved: dict[str, Any]) -> tuple[str, bool]:
+    """Table and findings, and whether the verdict is clean.
+
+    Raises
+    ------
+    Exception
+        Of any kind, if a part is missing or of another type.
+    """
     import pandas as pd
 
     from capsule_id.report.columns import table_text, verdict_text
 
+    findings, clean, synthetic = saved["verdict"]["findings"], saved["verdict"]["clean"], saved["synthetic"]
+    if not (isinstance(clean, bool) and isinstance(synthetic, bool)):
+        raise TypeError("verdict.clean and synthetic must be true or false")
+    rows = {name: _row(entry) for name, entry in saved["parameters"].items()}
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
     texts = (f"{finding['level']:4} {finding['check']}: {finding['text']}" for finding in findings)
-    verdict = verdict_text(trust, [(finding["level"], finding["check"]) for finding in findings])
-    say("\n".join([table_text(frame, synthetic=bool(saved["synthetic"])), *texts, verdict]))
-    return 0 if clean else 3
+    verdict = verdict_text(saved["trust"], [(finding["level"], finding["check"]) for finding in findings])
+    return "\n".join([table_text(frame, synthetic=synthetic), *texts, verdict]), clean
 
 
 def _row(entry: dict[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Fits of one rig or of several: result directory, table, verdict; one after the other, or on a Dask cluster."""
 
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,11 +10,11 @@ from typing import TYPE_CHECKING
 
 from capsule_id.commands.bifurcate import client_of
 from capsule_id.commands.compilation import prepare_jax
-from capsule_id.console import OnProgress, Progress, complain, one_line, save_traceback, say, stop_if_interrupted
+from capsule_id.console import OnProgress, Progress, complain, one_line, save_traceback, saved, say, stop_if_interrupted
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.kind import Registry, default_registry
-from capsule_id.output import CHAINS, WORK_FILES, check_directory, publish, work_in_progress
+from capsule_id.output import CHAINS, check_directory, publish, work_in_progress, write_file
 from capsule_id.rig.model import Rig
 from capsule_id.views import counted
 
@@ -75,25 +74,21 @@ def fingerprint_of(rig: Rig, options: Options, kinds: Registry) -> Mapping[str, 
     }
 
 
-def write_fit(
+def make_fit(
     rig: Rig,
     options: Options,
-    folder: Path,
     kinds: Registry,
-    progress: OnProgress,
+    store: Path | None = None,
+    progress: OnProgress | None = None,
     preliminary: Callable[["Fit"], None] | None = None,
 ) -> "Fit":
-    """Fit, and write the result and the saved chains to ``folder``. ``preliminary`` as in ``capsule_id.fit``."""
+    """The fit that the options ask for; ``store``, ``progress`` and ``preliminary`` as in ``capsule_id.fit``."""
     from capsule_id.api import fit
-    from capsule_id.report.write import write_result
 
-    words = options.seed, options.experiments, options.budget, folder / CHAINS, progress, kinds
+    words = options.seed, options.experiments, options.budget, store, progress, kinds
     result = fit(rig, *words, ess=options.ess, preliminary=preliminary)
     made = result.provenance.made[0], options.command
-    result = replace(result, provenance=replace(result.provenance, made=made))
-    progress(0, 1, "report")
-    write_result(result, folder)
-    return result
+    return replace(result, provenance=replace(result.provenance, made=made))
 
 
 def fit_one(
@@ -117,22 +112,27 @@ def fit_one(
     prepare_jax(options.cached, rig.has_runs and options.experiments != "bench")
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.report.columns import table_text, wrapped
+    from capsule_id.report.html import render
     from capsule_id.report.messages import messages_of
-    from capsule_id.report.write import write_report
+    from capsule_id.report.write import result_files, write_result
 
     make_experiments(rig, options.experiments, kinds)
     messages_of(kinds)  # refuses conflicting messages before the fit
     with work_in_progress(directory, fingerprint_of(rig, options, kinds), resume) as unfinished:
+        saved.set()
 
         def show_point(first: "Fit") -> None:
-            write_report(first, unfinished)
+            write_file(unfinished / "report.html", render(first, ()))
             table = [table_text(first.summary, synthetic=rig.synthetic), *wrapped(first.remarks)]
             progress.note("\n".join([f"point fit, before the sample; report: {unfinished / 'report.html'}", *table]))
 
         # A fit of bench tests ends as soon.
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
-        result = write_fit(rig, options, unfinished, kinds, progress, preliminary)
+        result = make_fit(rig, options, kinds, unfinished / CHAINS, progress, preliminary)
+        progress(0, 1, "report")
+        write_result(result_files(result), unfinished)
         publish(unfinished, directory)
+    saved.clear()
     report = directory / "report.html"
     if as_json:
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
@@ -200,8 +200,8 @@ def fit_many(
                 _write(found, root / rig.name, fingerprint_of(rig, options, kinds))
             except Exception as error:  # the other rigs are fitted all the same
                 stop_if_interrupted()
-                saved = "" if isinstance(error, InputError | OSError) else f"; {save_traceback(error)}"
-                failures.append(f"{rig.name} ({one_line(error)}{saved})")
+                traceback = "" if isinstance(error, InputError | OSError) else f"; {save_traceback(error)}"
+                failures.append(f"{rig.name} ({one_line(error)}{traceback})")
             else:
                 say(f"{rig.name}: {found.verdict}; report: {root / rig.name / 'report.html'}{found.changes}")
                 unclean += [rig.name] * (not found.clean)
@@ -214,7 +214,7 @@ def fit_many(
 
 
 def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> FittedRig:
-    """Fit one rig in a folder of its own; on a worker with the kinds installed there.
+    """Fit one rig; on a worker with the kinds installed there.
 
     Raises
     ------
@@ -223,21 +223,14 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
     """
     prepare_jax(options.cached, rig.has_runs and options.experiments != "bench")
     from capsule_id.report.columns import wrapped
+    from capsule_id.report.write import result_files
 
-    kinds = kinds or default_registry()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        try:
-            result = write_fit(rig, options, folder, kinds, lambda *_: None)
-        except KeyboardInterrupt:
-            raise RuntimeError("interrupted") from None
-        files = {
-            path.relative_to(folder).as_posix(): path.read_bytes()
-            for path in folder.rglob("*")
-            if path.is_file() and path.name not in WORK_FILES
-        }
+    try:
+        result = make_fit(rig, options, kinds or default_registry())
+    except KeyboardInterrupt:
+        raise RuntimeError("interrupted") from None
     changes = "".join(f"\n{line}" for line in wrapped(result.remarks))
-    return FittedRig(files, changes, result.verdict, result.clean)
+    return FittedRig(result_files(result), changes, result.verdict, result.clean)
 
 
 def _on_cluster(
@@ -254,8 +247,8 @@ def _on_cluster(
 
 
 def _write(found: FittedRig, directory: Path, fingerprint: Mapping[str, object]) -> None:
+    from capsule_id.report.write import write_result
+
     with work_in_progress(directory, fingerprint, resume=False) as unfinished:
-        for name, content in found.files.items():
-            (unfinished / name).parent.mkdir(exist_ok=True)
-            (unfinished / name).write_bytes(content)
+        write_result(found.files, unfinished)
         publish(unfinished, directory)

@@ -10,6 +10,7 @@ from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_a
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import complain, say
 from capsule_id.errors import InputError, refusing
+from capsule_id.output import replace_file
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
     view = MotionView(np.asarray(t.times), channels, x_rel, rate, x_rel[section], rate[section], G)
     with own_style():
         overview(view, figure := new_figure(10.0, 4.8))
-        path.write_bytes(png(figure))
+        replace_file(path, png(figure))
 
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:

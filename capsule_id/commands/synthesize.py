@@ -52,7 +52,8 @@ def _robot(args: argparse.Namespace) -> int:
     values = dict(_assignment(text) for text in args.set)
     if unknown := sorted(set(values) - set(ROBOT)):
         raise InputError("--set takes a parameter of the robot", unknown[0], f"choose from {', '.join(ROBOT)}")
-    synthesize_robot(args.directory, args.seed, None, values)
+    with refusing("DIR must be writable", "name another one", args.directory):
+        synthesize_robot(args.directory, args.seed, None, values)
     say(f"wrote {args.directory} (SYNTHETIC, seed {args.seed})")
     return 0
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.inference.moves import Moves, Parts
+from capsule_id.output import replace_file
 
 # ensemble: One emcee ensemble that stores its own state and advances draw by draw.
 #
@@ -81,7 +82,7 @@ def initial_state(positions: np.ndarray, random: np.random.RandomState) -> emcee
 
 
 class OpenBackend(emcee.backends.HDFBackend):
-    """emcee's HDF5 backend on a file that stays open; emcee's own backend opens the file six times a step."""
+    """emcee's HDF5 backend on an open file, which may be in memory; emcee's own opens a file on disk six times a step."""
 
     def __init__(self, file: h5py.File, name: str) -> None:
         super().__init__(file.filename, name)
@@ -91,50 +92,48 @@ class OpenBackend(emcee.backends.HDFBackend):
         del mode
         return nullcontext(self._file)
 
+    @property
+    def initialized(self) -> bool:
+        """Whether the file has draws of this ensemble; emcee asks for a file on disk."""
+        return self.name in self._file
+
     def last_state(self) -> emcee.State | None:
         """State after the last stored draw; None if there is no draw."""
         return self.get_last_sample() if self.initialized and self.iteration else None
 
 
-# chain store: Storage of chains on disk that survives termination of the process at any moment.
+# chain store: Storage of chains that survives termination of the process at any moment.
 #
-# emcee writes every draw into an HDF5 file in several steps (coordinates, random state, counter). A process killed
-# between two steps leaves an inconsistent file. A resumed run therefore starts from a copy made between draws, which
-# stores its own digest. The file that emcee writes is never read after an interruption.
+# emcee writes every draw into an HDF5 file in several steps (coordinates, random state, counter), and HDF5 ends the
+# process where the disk is full. The file is therefore in memory; its copies on disk are made between draws.
 
 
 #: Time between two copies, s.
 SAVE_EVERY = 5.0
 #: Length of the digest of a copy, bytes.
 _DIGEST = hashlib.sha256().digest_size
-
-
-def saved_copy(store: Path) -> Path:
-    """Path of the copy of ``store`` from which an interrupted run resumes."""
-    return store.with_suffix(".saved")
+#: By so much the file in memory grows at a time, bytes.
+_GROWTH = 2**22
 
 
 class ChainStore:
-    """Context manager of the open HDF5 file that emcee writes, and of its copy.
+    """Context manager of the HDF5 file in memory that emcee writes, and of its copy on disk.
 
     Parameters
     ----------
-    store : the file; the last copy replaces it, or it is removed if no copy has a valid digest
+    store : the copy, from which an interrupted run resumes; one without a valid digest is discarded
     fingerprint : of the sampled density and the seed; a copy with another one is discarded
     """
 
     def __init__(self, store: Path, fingerprint: str) -> None:
-        self._store, self._copy, self._next = store, saved_copy(store), time.monotonic() + SAVE_EVERY
-        store.unlink(missing_ok=True)
-        saved = self._copy.read_bytes() if self._copy.exists() else b""
+        self._store, self._next = store, time.monotonic() + SAVE_EVERY
+        saved = store.read_bytes() if store.exists() else b""
         content = saved[_DIGEST:]
-        if content and hashlib.sha256(content).digest() == saved[:_DIGEST]:
-            store.write_bytes(content)
-        self._file = h5py.File(store, "a")
+        valid = content and hashlib.sha256(content).digest() == saved[:_DIGEST]
+        self._file = h5py.File.in_memory(content if valid else None, block_size=_GROWTH)
         if self._file.attrs.setdefault("fingerprint", fingerprint) != fingerprint:
             self._file.close()
-            store.unlink()
-            self._file = h5py.File(store, "w")
+            self._file = h5py.File.in_memory(block_size=_GROWTH)
             self._file.attrs["fingerprint"] = fingerprint
 
     def __enter__(self) -> "ChainStore":
@@ -153,10 +152,15 @@ class ChainStore:
             self.save()
 
     def save(self) -> None:
-        """Copy the file now; a single rename makes the copy atomic."""
+        """Copy the file now; a single rename makes the copy atomic.
+
+        Raises
+        ------
+        OutputError
+            If the disk is full; the last copy stays.
+        """
         self._file.flush()
-        content = self._store.read_bytes()
-        temporary = self._copy.with_suffix(".saved-new")
-        temporary.write_bytes(hashlib.sha256(content).digest() + content)
-        temporary.replace(self._copy)
+        content = self._file.id.get_file_image()
+        # The copy before it, this one, and the result, which is about as large.
+        replace_file(self._store, hashlib.sha256(content).digest() + content, 3 * len(content))
         self._next = time.monotonic() + SAVE_EVERY

@@ -104,7 +104,7 @@ def sample_posterior(
     Parameters
     ----------
     budget : emcee steps of an ensemble after burn-in; None draws no sample
-    store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
+    store : file for a copy of the chains every few seconds; sampling resumes from the draws in it
     progress, ess : see ``capsule_id.inference.sampling.sample``
     """
     target, posterior = point.target, None

@@ -375,7 +375,7 @@ def sample(
     ----------
     seed : the same seed gives the same draws, also when an interrupted run resumes from ``store``
     budget : emcee steps of an ensemble after burn-in; fewer in proportion where an evaluation is slow
-    store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
+    store : file for a copy of the chains every few seconds; sampling resumes from the draws in it
     progress : called with (draws done, draws until the next check, name of the stage)
     ess : bulk and tail effective sample size of every parameter at which the sampling stops
     """

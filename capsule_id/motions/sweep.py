@@ -1,6 +1,7 @@
 """Bifurcation diagrams, two-parameter maps, basins of attraction: settled motions over any quantity of the model."""
 
 import hashlib
+import io
 import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,8 +15,9 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
+from capsule_id import console
 from capsule_id.console import OnProgress, stop_if_interrupted
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, writing
 from capsule_id.motions.response import (
     SAME_POSITION,
     SAME_VELOCITY,
@@ -26,6 +28,7 @@ from capsule_id.motions.response import (
     settle,
     settled_label,
 )
+from capsule_id.output import replace_file
 from capsule_id.parameters import CAPSULE_LEAVES, LEAVES, SWEPT
 from capsule_id.physics.batches import CHUNK, lanes_of
 from capsule_id.physics.drive import Excitation, PeriodicDrive
@@ -217,6 +220,7 @@ def compute(
     begins = range(0, points.size, block)
     if store is not None:
         _check_store(store, points, settling, keep, block)
+        console.saved.set()
     saved = ((begin, _saved_block(store, begin)) for begin in begins)
     parts = {begin: part for begin, part in saved if part is not None}
     missing = {begin: slice(begin, begin + block) for begin in begins if begin not in parts}
@@ -224,7 +228,7 @@ def compute(
     _report(progress, done, points.size)
     for begin, part in _blocks(points, settling, tuple(keep), missing, client):
         parts[begin] = part
-        _save_block(store, begin, part)
+        _save_block(store, begin, part, len(begins) - len(parts) + 1)
         done += len(part["status"])
         _report(progress, done, points.size)
     return {name: np.concatenate([parts[begin][name] for begin in begins]) for name in keep}
@@ -275,7 +279,8 @@ def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Seq
         "block": block,
         "jax": jax.__version__,
     }
-    store.mkdir(parents=True, exist_ok=True)
+    with writing(store):
+        store.mkdir(parents=True, exist_ok=True)
     file = store / FINGERPRINT
     if file.exists():
         try:
@@ -288,20 +293,19 @@ def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Seq
         return
     if any(store.iterdir()):
         raise InputError("a store is a new folder or one of this program", "it is neither", "name another one", store)
-    file.write_text(json.dumps(mine, indent=1), encoding="utf-8", newline="\n")
+    replace_file(file, json.dumps(mine, indent=1))
 
 
 def _file(store: Path, begin: int) -> Path:
     return store / f"block_{begin:09d}.npz"
 
 
-def _save_block(store: Path | None, begin: int, part: MotionColumns) -> None:
+def _save_block(store: Path | None, begin: int, part: MotionColumns, left: int) -> None:
+    """Save a block; ``left`` blocks are still to be saved, with this one."""
     if store is None:
         return
-    new = store / "block.new"
-    with new.open("wb") as file:
-        np.savez(file, **part)  # pyright: ignore[reportArgumentType]  (names are ours: none is "file")
-    new.replace(_file(store, begin))
+    np.savez(content := io.BytesIO(), **part)  # pyright: ignore[reportArgumentType]  (names are ours: none is "file")
+    replace_file(_file(store, begin), content.getvalue(), left * content.tell())
 
 
 def _saved_block(store: Path | None, begin: int) -> MotionColumns | None:

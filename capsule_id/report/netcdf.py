@@ -1,5 +1,6 @@
 """``posterior.nc`` in the groups of ArviZ, written and read back, and simulated motions as tables."""
 
+import io
 import re
 from collections import defaultdict
 from collections.abc import Container, Mapping
@@ -12,6 +13,7 @@ import xarray as xr
 
 from capsule_id.errors import InputError
 from capsule_id.inference.result import Pointwise, Posterior, Result
+from capsule_id.output import replace_file
 from capsule_id.parameters import TABLE
 
 # netcdf: ``posterior.nc``: the sample in the groups and dimensions that ArviZ knows.
@@ -21,19 +23,15 @@ from capsule_id.parameters import TABLE
 _DIMENSIONS = {"k2": "spring"}
 
 
-def write_posterior(result: Result, path: Path) -> None:
-    """Write the sample of ``result`` as netCDF (h5netcdf), to be opened by ``arviz.from_netcdf``.
-
-    Raises
-    ------
-    ValueError
-        If nothing was sampled, or a name is used both alone and as a family.
-    """
-    data_tree(result).to_netcdf(path, engine="h5netcdf")
+def netcdf_bytes(data: xr.DataTree | xr.Dataset) -> bytes:
+    """``data`` as a netCDF file (h5netcdf). It is made in memory: HDF5 ends the process where the disk is full."""
+    file = io.BytesIO()
+    data.to_netcdf(file, engine="h5netcdf")
+    return file.getvalue()
 
 
 def data_tree(result: Result) -> xr.DataTree:
-    """The sample of ``result`` in the groups of ArviZ.
+    """The sample of ``result`` in the groups of ArviZ; ``arviz.from_netcdf`` opens its ``netcdf_bytes``.
 
     ``posterior``, ``sample_stats``: dimensions ``chain`` (every walker of every ensemble, with the coordinate
     ``ensemble``) and ``draw``. ``log_likelihood`` (one variable ``readings``) and ``posterior_predictive``: at every so
@@ -99,8 +97,8 @@ def read_sample(path: Path, saved: Posterior) -> tuple[Posterior, dict[str, np.n
 
     Raises
     ------
-    OSError, KeyError, ValueError
-        If the file is absent, damaged, or another fit wrote it.
+    Exception
+        Of any kind, if the file is absent, damaged, or another fit wrote it.
     """
     with xr.open_datatree(path, engine="h5netcdf") as tree:
         tree.load()
@@ -207,17 +205,17 @@ def write_motion(path: Path, columns: Mapping[str, np.ndarray], provenance: Mapp
 
     Raises
     ------
-    OSError
+    OutputError
         If the file cannot be written.
     """
     if path.suffix == ".csv":
         table = pd.DataFrame({f"{name} [{COLUMNS[name][0]}]": values for name, values in columns.items()})
-        table.to_csv(path, index=False, lineterminator="\n")
+        replace_file(path, table.to_csv(index=False, lineterminator="\n"))
         return
     about = {name: {"units": unit, "long_name": meaning} for name, (unit, meaning) in COLUMNS.items()}
     about["time"] = {"units": "s"}
     data = {name: ("time", values, about[name]) for name, values in columns.items()}
-    xr.Dataset(data, attrs=dict(provenance)).set_coords("time").to_netcdf(path, engine="h5netcdf")
+    replace_file(path, netcdf_bytes(xr.Dataset(data, attrs=dict(provenance)).set_coords("time")))
 
 
 # posterior file: ``posterior.nc`` read back: some draws.
@@ -235,7 +233,7 @@ def read_draws(path: Path, count: int, seed: int) -> dict[str, np.ndarray]:
         with xr.open_dataset(path, group="posterior", engine="h5netcdf") as data:
             size = data.sizes["chain"] * data.sizes["draw"]
             columns = _members_of(data)
-    except (OSError, KeyError, ValueError) as error:
+    except Exception as error:  # a damaged file raises any
         rule, remedy = "--posterior takes the posterior.nc of a result", "give results/<rig>/posterior.nc"
         raise InputError(rule, type(error).__name__, remedy, path) from None
     if not 1 <= count <= size:

@@ -3,9 +3,12 @@
 A tree of frozen dataclasses becomes JSON; its arrays are saved beside it. The draws stay in ``posterior.nc``.
 """
 
+import hashlib
+import io
 import json
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from capsule_id.console import one_line
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Result
@@ -21,48 +25,81 @@ from capsule_id.report.netcdf import read_sample
 
 #: The file in the directory of a result, and the sample beside it.
 SAVED, SAMPLE = Path("figures") / "data.npz", "posterior.nc"
-#: Errors of a file that is no result, or of another version.
-READ_ERRORS = (OSError, KeyError, ValueError, TypeError, AttributeError, ImportError, zipfile.BadZipFile)
-_TREE = "tree"
+_KEPT = tuple(field.name for field in fields(Result) if field.name != "registry")
+_TREE, _DIGESTS = "tree.npy", "digests"
 
 
-def save(result: Result, directory: Path) -> None:
-    """Write ``SAVED`` into ``directory``, which has a folder ``figures``. The registry is not saved."""
+def saved_bytes(result: Result, sample: bytes) -> bytes:
+    """The content of ``SAVED``, with digests of itself and of ``sample``, the content of ``SAMPLE``.
+
+    The registry is not saved.
+    """
     posterior = result.posterior
     if posterior is not None:
         posterior = replace(posterior, draws=np.zeros(0), lp=np.zeros(0))
     light = replace(result, pointwise=None, prior={}, posterior=posterior)
     arrays: dict[str, np.ndarray] = {}
-    kept = {field.name: getattr(light, field.name) for field in fields(Result) if field.name != "registry"}
-    text = json.dumps(_encode(kept, arrays)).encode("utf-8")
-    arrays[_TREE] = np.frombuffer(text, np.uint8)
-    with zipfile.ZipFile(directory / SAVED, "w", zipfile.ZIP_DEFLATED) as file:
-        for name, values in arrays.items():
-            with file.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, values, allow_pickle=False)
+    text = json.dumps(_encode({name: getattr(light, name) for name in _KEPT}, arrays)).encode("utf-8")
+    members = {f"{name}.npy": _npy(values) for name, values in arrays.items()}
+    members[_TREE] = _npy(np.frombuffer(text, np.uint8))
+    digests = f"{_digest(members)}\n{hashlib.sha256(sample).hexdigest()}"
+    with zipfile.ZipFile(content := io.BytesIO(), "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in (members | {_DIGESTS: digests.encode()}).items():
+            with file.open(name, "w", force_zip64=True) as member:
+                member.write(data)
+    return content.getvalue()
+
+
+def _npy(values: np.ndarray) -> bytes:
+    np.lib.format.write_array(content := io.BytesIO(), values, allow_pickle=False)
+    return content.getvalue()
+
+
+def _digest(members: Mapping[str, bytes]) -> str:
+    """Digest of names and contents."""
+    one = {name: hashlib.sha256(data).hexdigest() for name, data in members.items()}
+    return hashlib.sha256(repr(one).encode()).hexdigest()
 
 
 def load(directory: Path, registry: Registry) -> dict[str, Any]:
-    """The fields of the ``Result`` that ``save`` and ``write_posterior`` wrote into ``directory``.
+    """The fields of the ``Result`` that ``write_result`` wrote into ``directory``.
 
     Raises
     ------
     InputError
-        If ``directory`` holds no result, or one that another version wrote.
+        If ``directory`` holds no result, one that another version wrote, or a file that has changed since.
     """
     roots = {"capsule_id", *(kind.settings.__module__.partition(".")[0] for kind in registry.kinds)}
-    try:
-        with np.load(directory / SAVED, allow_pickle=False) as arrays:
-            kept = _decode(json.loads(arrays[_TREE].tobytes().decode("utf-8")), arrays, roots)
-        if kept["posterior"] is not None:
-            posterior, prior, pointwise = read_sample(directory / SAMPLE, kept["posterior"])
+    with _reading(directory / SAVED), zipfile.ZipFile(directory / SAVED) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+        own, of_sample = members.pop(_DIGESTS).decode().split("\n")
+        _check(own, _digest(members))
+        arrays = {Path(name).stem: np.load(io.BytesIO(data), allow_pickle=False) for name, data in members.items()}
+        kept = _decode(json.loads(arrays[Path(_TREE).stem].tobytes().decode("utf-8")), arrays, roots)
+        posterior = {name: kept[name] for name in _KEPT}["posterior"]
+    if posterior is not None:
+        with _reading(directory / SAMPLE):
+            _check(of_sample, hashlib.sha256((directory / SAMPLE).read_bytes()).hexdigest())
+            posterior, prior, pointwise = read_sample(directory / SAMPLE, posterior)
             kept |= {"posterior": posterior, "prior": prior, "pointwise": pointwise}
-    except READ_ERRORS as error:
-        rule = "a result must be a directory that this version of fit-params wrote"
-        absent = isinstance(error, FileNotFoundError | NotADirectoryError)
-        value = f"it has no {Path(str(error.filename)).name}" if absent else f"{type(error).__name__}: {error}"
-        raise InputError(rule, value, "run fit-params again", directory) from error
     return {**kept, "registry": registry}
+
+
+def _check(stated: str, found: str) -> None:
+    if stated != found:
+        raise ValueError("it has changed since it was written")
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Any error is one of ``path``, a file of a result: it is absent, damaged, or another version wrote it."""
+    try:
+        yield
+    except Exception as error:
+        absent = isinstance(error, FileNotFoundError | NotADirectoryError)
+        rule = "a result must be a directory that this version of fit-params wrote"
+        value = f"it has no {path.name}" if absent else one_line(error)
+        raise InputError(rule, value, "run fit-params again", path) from error
 
 
 def _encode(value: object, arrays: dict[str, np.ndarray]) -> Any:

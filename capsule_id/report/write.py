@@ -1,4 +1,4 @@
-"""Write a result as files into an existing directory."""
+"""The files of a result, and writing them into an existing directory."""
 
 import json
 import math
@@ -10,42 +10,49 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from capsule_id.errors import writing
 from capsule_id.inference.result import Result
+from capsule_id.output import as_utf8, write_file
 from capsule_id.report.columns import columns_of
 from capsule_id.report.figures.style import own_style
-from capsule_id.report.html import Picture, pictures, render
+from capsule_id.report.html import pictures, render
 from capsule_id.report.messages import finding_text, messages_of, title_of
-from capsule_id.report.netcdf import write_posterior
-from capsule_id.report.saved import save
+from capsule_id.report.netcdf import data_tree, netcdf_bytes
+from capsule_id.report.saved import SAMPLE, SAVED, saved_bytes
 
 
-def write_result(result: Result, directory: Path) -> None:
-    """Write parameters.json, parameters.csv, posterior.nc (where there is a sample), report.html, figures/*.png
-    and figures/data.npz.
+def result_files(result: Result) -> dict[str, bytes]:
+    """The files of a result by their paths: parameters.json, parameters.csv, posterior.nc (where there is a sample),
+    report.html, figures/*.png and figures/data.npz.
+    """
+    with own_style():
+        drawn = pictures(result)
+    text = json.dumps(parameters_json(result), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    texts = {
+        "report.html": render(result, drawn),
+        "parameters.csv": table_frame(result).to_csv(lineterminator="\n"),
+        "parameters.json": text,
+    }
+    sample = b"" if result.posterior is None else netcdf_bytes(data_tree(result))
+    files = {f"figures/{picture.name}.png": picture.png for picture in drawn}
+    files |= {SAVED.as_posix(): saved_bytes(result, sample)} | ({SAMPLE: sample} if sample else {})
+    return files | {name: as_utf8(text) for name, text in texts.items()}
+
+
+def write_result(files: Mapping[str, bytes], directory: Path) -> None:
+    """Write ``result_files`` into an existing directory.
 
     Raises
     ------
-    FileNotFoundError
-        If ``directory`` does not exist: the caller makes and names it.
+    OutputError
+        If the operating system refuses.
     """
-    figures = directory / "figures"
-    figures.mkdir(exist_ok=True)
-    with own_style():
-        drawn = pictures(result)
-    for picture in drawn:
-        (figures / f"{picture.name}.png").write_bytes(picture.png)
-    save(result, directory)
-    write_report(result, directory, drawn)
-    if result.posterior is not None:
-        write_posterior(result, directory / "posterior.nc")
-    table_frame(result).to_csv(directory / "parameters.csv", lineterminator="\n")
-    text = json.dumps(parameters_json(result), indent=1, ensure_ascii=False, allow_nan=False)
-    (directory / "parameters.json").write_text(text + "\n", encoding="utf-8", newline="\n")
-
-
-def write_report(result: Result, directory: Path, drawn: Sequence[Picture] = ()) -> None:
-    """Write report.html with these pictures."""
-    (directory / "report.html").write_text(render(result, drawn), encoding="utf-8", newline="\n")
+    needed = sum(map(len, files.values()))
+    with writing(directory):
+        (directory / "figures").mkdir(exist_ok=True)
+    for name, content in files.items():
+        write_file(directory / name, content, needed)
+        needed -= len(content)
 
 
 def parameters_json(result: Result) -> dict[str, object]:

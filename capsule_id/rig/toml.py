@@ -119,12 +119,23 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
             1,
             1,
         )
+
+    def number(written: str) -> float:
+        """A float; one that a float64 cannot hold is refused where it first stands."""
+        value = float(written.replace("_", ""))
+        if value == 0.0 and re.search("[1-9]", re.split("[eE]", written)[0]):
+            rule, remedy = "a number must be one that float64 holds", "write 0: float64 begins at 5e-324"
+            raise InputError(rule, written, remedy, path, *_line_and_column(text, text.index(written)))
+        return value
+
     try:
-        data = tomllib.loads(text)
+        data = tomllib.loads(text, parse_float=number)
         scanner = _Scanner(text)
         scanner.scan()
     except RecursionError:
         raise InputError("nesting must be shallow", "too many brackets", _SHALLOW, path, 1, 1) from None
+    except InputError:
+        raise
     except ValueError as error:
         message = str(error)
         found = re.search(r"\(at line (\d+), column (\d+)\)", message)

@@ -200,6 +200,17 @@ def test_what_is_not_ours_stays(capsys: pytest.CaptureFixture[str]) -> None:
     assert listing(Path()) == before
 
 
+def test_what_a_kill_has_left_of_a_store_is_removed(tmp_path: Path) -> None:
+    """Before, a store without its points was taken for a folder of somebody else."""
+    for names in ([], ["block_000000004.npz"], ["points.json.new"], ["block_000000000.npz.new", "points.json"]):
+        store = tmp_path / "a.nc.partial"
+        store.mkdir()
+        for name in names:
+            (store / name).touch()
+        assert command.prepare_store(tmp_path / "a.nc", resume=False) == store
+        assert not store.exists()
+
+
 def test_progress_has_a_rate_and_the_time_left(capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(*OVER, *SHORT[:-1]) == 0
     lines = capsys.readouterr().err.splitlines()

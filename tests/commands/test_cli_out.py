@@ -1,20 +1,27 @@
 """The output directory of ``fit-params``: refused, replaced, and unchanged after a refusal."""
 
+import errno
+import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Any, cast
 
 import pytest
+from filelock import FileLock
 
+from capsule_id import output
 from capsule_id.cli import fit_params
-from capsule_id.errors import InputError
-from capsule_id.output import CHAINS, LOCK, STATE, check_directory, publish, work_in_progress
-from tests.cli_tools import argv, environment, listing, run, small_rig
+from capsule_id.errors import InputError, OutputError
+from capsule_id.output import CHAINS, LOCK, STATE, check_directory, publish, replace_file, work_in_progress
+from capsule_id.report.write import write_result
+from tests.cli_tools import Killed, argv, environment, failing, listing, run, small_rig
 
 RESULT = {"parameters.json", "parameters.csv", "report.html", "figures"}
 
@@ -108,43 +115,141 @@ def test_what_is_replaced(here: Path, there: str) -> None:
     assert json.loads((here / "out" / "parameters.json").read_text())["mark"] == "new"
 
 
-class Killed(BaseException):
-    """Simulates a kill: no handler catches it."""
+OLD_FILES = ("parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures/data.npz")
+OLD_FILES += tuple(f"figures/{letter}.png" for letter in "abcdefg")
 
 
-def die_at(patch: pytest.MonkeyPatch, moment: int) -> None:
-    """Die instead of the ``moment``-th renaming or removal."""
-    steps = count()
-
-    def dying(real: Callable[..., object]) -> Callable[..., object]:
-        def step(self: Path, *args: object, **options: object) -> object:
-            if next(steps) == moment:
-                raise Killed
-            return real(self, *args, **options)
-
-        return step
-
-    patch.setattr(Path, "rename", dying(Path.rename))
-    patch.setattr(Path, "unlink", dying(Path.unlink))
+def whole_run(directory: Path, mark: str, resume: bool = False, error: BaseException | None = None) -> None:
+    """All file operations of ``fit-params`` without the fit; every file says ``mark``."""
+    check_directory(directory)
+    with work_in_progress(directory, {"seed": 0}, resume) as partial:
+        replace_file(partial / CHAINS, mark)
+        text = json.dumps({"mark": mark, "provenance": {"versions": {"capsule-id": "0"}}})
+        write_result(dict.fromkeys(OLD_FILES, mark.encode()) | {"parameters.json": text.encode()}, partial)
+        if error is not None:
+            raise error
+        publish(partial, directory)
 
 
-@pytest.mark.parametrize("resume", [False, True])
-@pytest.mark.parametrize("moment", range(6))
-def test_a_kill_between_the_steps_of_publishing(
-    here: Path, monkeypatch: pytest.MonkeyPatch, moment: int, resume: bool
-) -> None:
+def mark_of(directory: Path) -> str | None:
+    """What all files of a complete result say; None if there is none."""
+    if not directory.exists():
+        return None
+    marks = {(directory / name).read_text() for name in OLD_FILES[1:]}
+    marks.add(json.loads((directory / "parameters.json").read_text())["mark"])
+    (mark,) = marks
+    return mark
+
+
+def ended_at(moment: int, *words: Any) -> bool:
+    """Whether ``whole_run``, killed instead of its ``moment``-th operation on files, has come so far."""
+    locks = list[FileLock]()
+
+    def lock(*words: Any, **options: Any) -> FileLock:
+        locks.append(FileLock(*words, **options))
+        return locks[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(output, "FileLock", lock)
+        with failing(Killed, moment) as operations, suppress(Killed):
+            whole_run(*words)
+    for each in locks:  # the operating system releases them
+        each.release(force=True)
+    return len(operations) > moment
+
+
+def recovered(directory: Path, ends: str) -> None:
+    """What the next run makes of the state that a kill has left: the old or the new result, and nothing else."""
+    before = mark_of(directory)
+    if ends == "refused":
+        with pytest.raises(InputError, match="mend it"):
+            whole_run(directory, "newest", error=InputError("a rule", "broken", "mend it"))
+        assert mark_of(directory) in ({before} if before else {None, "old", "new"})
+        return
+    whole_run(directory, "newest", resume=ends == "resumed" and (directory.parent / "out.partial" / STATE).exists())
+    assert mark_of(directory) == "newest"
+    assert {path.name for path in directory.parent.iterdir()} == {"out"}
+    assert len([path for path in directory.rglob("*") if path.is_file()]) == len(OLD_FILES)
+
+
+@pytest.mark.parametrize("ends", ["anew", "resumed", "refused"])
+@pytest.mark.parametrize("old", [True, False])
+def test_a_kill_at_any_operation(tmp_path: Path, old: bool, ends: str) -> None:
     """DIR is then the old result, the new one or absent, never incomplete; the next run repairs it."""
-    old = fake_result(here / "out") / "parameters.json"
-    with pytest.raises(Killed), work_in_progress(here / "out", {"seed": 0}, resume=False) as partial:  # noqa: PT012
-        (partial / "parameters.json").write_text(old.read_text().replace("old", "new"))
+    for moment in count():
+        directory = tmp_path / str(moment) / "out"
+        if old:
+            whole_run(directory, "old")
+        with suppress(KeyboardInterrupt):
+            whole_run(directory, "stopped", error=KeyboardInterrupt())
+        killed = ended_at(moment, directory, "new")
+        assert mark_of(directory) in ("old", "new", None)
+        if old and not directory.exists():
+            assert mark_of(directory.parent / "out.partial.old") == "old"
+        recovered(directory, ends)
+        if old:
+            assert directory.exists()
+        if not killed:
+            break
+    assert moment >= (40 if old else 20)
+
+
+@pytest.mark.full
+def test_two_kills_at_any_operations(tmp_path: Path) -> None:
+    for first, second in itertools.product(range(0, 50, 6), range(0, 65, 2)):
+        directory = tmp_path / f"{first}-{second}" / "out"
+        whole_run(directory, "old")
+        ended_at(first, directory, "new")
+        ended_at(second, directory, "newer")
+        recovered(directory, "refused")
+        assert directory.exists()
+        recovered(directory, "anew")
+        shutil.rmtree(directory.parent)
+
+
+def test_a_full_disk_at_any_operation(tmp_path: Path) -> None:
+    """One line names the folder; the old result stays, and the run resumes."""
+    refused = 0
+    for moment in count():
+        directory = tmp_path / str(moment) / "out"
+        whole_run(directory, "old")
+        text = None
+        with failing(partial(OSError, errno.ENOSPC, "No space left on device"), moment, moment + 1) as operations:
+            try:
+                whole_run(directory, "new")
+            except OutputError as error:
+                text = str(error)
+        assert mark_of(directory) == ("new" if text is None else "old")
+        if text is not None:
+            refused += 1
+            assert text.startswith(str(directory.parent))
+            assert "cannot be written: No space left on device; " in text
+            assert text.endswith(" MB are left; make space, or choose another folder")
+        recovered(directory, "resumed")
+        if len(operations) <= moment:
+            break
+    assert refused >= 15
+
+
+def test_a_read_only_result_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the fit: it could be moved, but not removed. The tests may run as an administrator, who can."""
+    directory, access = tmp_path / "out", os.access
+    whole_run(directory, "old")
+    for closed in (directory, directory / "figures"):
         with monkeypatch.context() as patch:
-            die_at(patch, moment)
-            publish(partial, here / "out")
-    assert not (here / "out").exists() or json.loads(old.read_text())["mark"] in ("old", "new")
-    fake_run(here / "out", resume and (here / "out.partial").exists(), "newest")
-    assert {path.name for path in here.iterdir()} == {"rig", "out"}
-    assert {path.name for path in (here / "out").iterdir()} == {"parameters.json"}
-    assert json.loads(old.read_text())["mark"] == "newest"
+            patch.setattr(os, "access", lambda path, mode, closed=closed: Path(path) != closed and access(path, mode))
+            with pytest.raises(InputError, match="must be writable"):
+                whole_run(directory, "new")
+    assert mark_of(directory) == "old"
+    shutil.copytree(directory, tmp_path / "out.partial.old")  # an earlier version could not remove it
+
+    def denied(folder: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", folder)
+
+    monkeypatch.setattr(shutil, "rmtree", denied)
+    with pytest.raises(InputError, match="Permission denied, move it away"):
+        whole_run(directory, "new")
+    assert mark_of(directory) == "old"
 
 
 def test_one_run_at_a_time(here: Path) -> None:
@@ -180,6 +285,20 @@ def test_a_damaged_state_is_refused_or_begun_afresh(here: Path, damage: str | No
         fake_run(here / "out", resume=True)
     fake_run(here / "out")
     assert {path.name for path in here.iterdir()} == {"rig", "out"}
+
+
+def test_resume_is_promised_where_something_is_saved(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``test_cli_resume`` holds the other half."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("capsule_id.commands.rigs.make_experiments", interrupted)
+    assert fit_params(["rig", "--no-sample", "--out", "out"]) == 130
+    assert capsys.readouterr().err == "fit-params: interrupted\n"
+    assert {path.name for path in here.iterdir()} == {"rig"}
 
 
 def test_resume_needs_something_to_resume(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,6 +17,7 @@ import xarray as xr
 from capsule_id.cli import fit_params
 from capsule_id.console import Progress
 from capsule_id.experiments.kind import default_registry
+from capsule_id.output import CHAINS
 from tests.cli_tools import CODE, environment, listing, same_result, small_rig
 
 WORDS = ("rig", "--quiet", "--max-steps", "60")
@@ -117,10 +118,7 @@ def test_interrupted_and_resumed(
     with monkeypatch.context() as patch:
         die_in_progress(patch, stage, draws, interrupt)
         assert fit_params([*WORDS, "--out", "out"]) == 130
-    assert (
-        capsys.readouterr().err
-        == "fit-params: interrupted; --resume continues the fit of one rig from the saved state\n"
-    )
+    assert capsys.readouterr().err == "fit-params: interrupted; --resume continues from the saved state\n"
     assert not (here / "out").exists()
     assert fit_params([*WORDS, "--out", "out", "--resume"]) == 0
     same_as_uninterrupted(here, "out")
@@ -160,17 +158,16 @@ def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPa
     with monkeypatch.context() as patch:
         die_in_progress(patch, "e", 80, lambda: (_ for _ in ()).throw(KeyboardInterrupt))
         assert fit_params([*WORDS, "--out", "out"]) == 130
-    for name in ("chains.h5", "chains.saved"):
-        file = here / "out.partial" / name
-        content = file.read_bytes()
-        middle = len(content) // 2
-        spoilt = {
-            "truncated": content[:middle],
-            "flipped": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
-            "empty": b"",
-            "missing": b"",
-        }[damage]
-        file.unlink() if damage == "missing" else file.write_bytes(spoilt)
+    file = here / "out.partial" / CHAINS
+    content = file.read_bytes()
+    middle = len(content) // 2
+    spoilt = {
+        "truncated": content[:middle],
+        "flipped": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+        "empty": b"",
+        "missing": b"",
+    }[damage]
+    file.unlink() if damage == "missing" else file.write_bytes(spoilt)
     assert fit_params([*WORDS, "--out", "out", "--resume"]) == 0
     same_as_uninterrupted(here, "out")
     _remove(here / "out")

@@ -94,5 +94,6 @@ def test_the_users_own_cache_is_left_alone(variables: dict[str, str], tmp_path: 
     variables[compilation.DIRECTORY] = str(own)
     compilation.prepare_jax(cached=True)
     assert variables[compilation.DIRECTORY] == str(own)
-    assert compilation.discard_damaged(f"{compilation.DAMAGED} for x: error").startswith(compilation.DAMAGED)
+    damaged = f"{compilation.CACHE_ERRORS[0]} for 'x': ValueError: x"
+    assert compilation.leave_cache(damaged) == damaged
     assert own.exists()

@@ -113,7 +113,7 @@ def test_a_step_that_does_not_end_is_ended(tmp_path: Path) -> None:
     assert fit.returncode == 130
     assert (tmp_path / "log").read_text(encoding="utf-8").splitlines()[
         -1
-    ] == "fit-params: interrupted; --resume continues the fit of one rig from the saved state"
+    ] == "fit-params: interrupted; --resume continues from the saved state"
 
 
 def test_a_worker_thread_that_does_not_end_is_ended(tmp_path: Path) -> None:

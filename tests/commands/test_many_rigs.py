@@ -96,14 +96,14 @@ def test_a_rig_that_fails_does_not_stop_the_others(
     here: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, scheduler: tuple[str, ...]
 ) -> None:
     """Standard error holds one line, also of the workers."""
-    fit = many_rigs.write_fit
+    fit = many_rigs.make_fit
 
     def written(rig: Any, *rest: Any) -> Any:
         if rig.name == "tilts":
             raise RuntimeError("no finite log-posterior")
         return fit(rig, *rest)
 
-    monkeypatch.setattr(many_rigs, "write_fit", written)
+    monkeypatch.setattr(many_rigs, "make_fit", written)
     assert fit_params(["tilts", "spring", "--no-sample", "--quiet", *scheduler]) == 1
     (line,) = capfd.readouterr().err.splitlines()
     assert "1 rig not fitted: tilts (RuntimeError: no finite log-posterior; traceback in " in line
@@ -136,7 +136,7 @@ def test_an_interruption_ends_the_study(
         signal.raise_signal(signal.SIGINT) if not scheduler else os.kill(os.getpid(), signal.SIGINT)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(many_rigs, "write_fit", interrupted)
+    monkeypatch.setattr(many_rigs, "make_fit", interrupted)
     assert fit_params(["tilts", "spring", "--no-sample", "--quiet", *scheduler]) == 130
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith("fit-params: interrupted")

@@ -14,12 +14,13 @@ import pandas as pd
 import pytest
 import xarray as xr
 
+from capsule_id.errors import OutputError
 from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report import columns
 from capsule_id.report.columns import table_text
-from capsule_id.report.netcdf import read_sample, write_posterior
-from capsule_id.report.write import parameters_json, write_result
+from capsule_id.report.netcdf import data_tree, netcdf_bytes, read_sample
+from capsule_id.report.write import parameters_json, result_files, write_result
 from capsule_id.views import Finding
 from tests.report.conftest import COLOURED
 
@@ -40,7 +41,7 @@ def arviz() -> ModuleType:
 @pytest.fixture(scope="module")
 def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("results")
-    write_result(result, path)
+    write_result(result_files(result), path)
     return path
 
 
@@ -151,7 +152,7 @@ def test_a_column_declared_once_is_in_every_output(
         monkeypatch.setattr(columns, "COLUMNS", (*columns.COLUMNS, *declared))
         folder = tmp_path / str(times)
         folder.mkdir()
-        write_result(result, folder)
+        write_result(result_files(result), folder)
         entry = json.loads((folder / "parameters.json").read_text(encoding="utf-8"))["parameters"]["k1"]
         table = pd.read_csv(folder / "parameters.csv", index_col="name")
         page = (folder / "report.html").read_text(encoding="utf-8")
@@ -168,7 +169,7 @@ def test_a_column_declared_once_is_in_every_output(
 
 @pytest.mark.full
 def test_point_fit_only_is_null_and_has_no_posterior(unsampled: Result, tmp_path: Path) -> None:
-    write_result(unsampled, tmp_path)
+    write_result(result_files(unsampled), tmp_path)
     assert not (tmp_path / "posterior.nc").exists()
     entry = _strict((tmp_path / "parameters.json").read_text(encoding="utf-8"))["parameters"]["k1"]
     assert entry["map"] == 1421.3
@@ -199,18 +200,18 @@ def test_csv_reads_back(folder: Path, result: Result) -> None:
 
 
 def test_directory_must_exist(result: Result, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        write_result(result, tmp_path / "absent")
+    with pytest.raises(OutputError, match="No such file"):
+        write_result(result_files(result), tmp_path / "absent")
     assert not (tmp_path / "absent").exists()
 
 
 def test_same_result_same_bytes(folder: Path, maker: Callable[..., Result], tmp_path: Path) -> None:
-    write_result(maker(), tmp_path)
+    write_result(result_files(maker()), tmp_path)
     for path in (p for p in folder.rglob("*") if p.is_file()):
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
     other = tmp_path / "other"
     other.mkdir()
-    write_result(maker(seed=1), other)
+    write_result(result_files(maker(seed=1)), other)
     assert (other / "posterior.nc").read_bytes() != (folder / "posterior.nc").read_bytes()
     assert (other / "report.html").read_bytes() != (folder / "report.html").read_bytes()
 
@@ -309,7 +310,9 @@ def test_every_label_keeps_its_readings(result: Result, tmp_path: Path) -> None:
     pointwise = Pointwise(density, rows, replicates, np.arange(0, 8, 2), np.arange(0, 20, 4), 2)
     observed = {label: rng.normal(size=n) for label, n in sizes.items()}
     prior = {f"noise_sd[{label}]": rng.normal(size=7) for label in labels}
-    write_posterior(dataclasses.replace(result, observed=observed, pointwise=pointwise, prior=prior), tmp_path / "x.nc")
+    (tmp_path / "x.nc").write_bytes(
+        netcdf_bytes(data_tree(dataclasses.replace(result, observed=observed, pointwise=pointwise, prior=prior)))
+    )
     _, read_prior, found = read_sample(tmp_path / "x.nc", cast(Posterior, result.posterior))
     read = cast(Pointwise, found)
     assert list(read.log_likelihood) == list(read.replicates) == labels
@@ -325,31 +328,31 @@ def test_a_long_label_does_not_make_a_long_file_name(result: Result, tmp_path: P
     long = [
         dataclasses.replace(item, label=letter * 300) for item, letter in zip(result.comparisons, "aab", strict=False)
     ]
-    write_result(dataclasses.replace(result, comparisons=tuple(long)), tmp_path)
+    write_result(result_files(dataclasses.replace(result, comparisons=tuple(long))), tmp_path)
     assert len([path for path in (tmp_path / "figures").glob("*.png") if len(path.stem) >= 80]) == 3
 
 
 def test_without_arrays_only_the_sample_is_written(result: Result, tmp_path: Path, arviz: ModuleType) -> None:
     bare = dataclasses.replace(result, fixed={}, observed={}, prior={}, pointwise=None)
-    write_posterior(bare, tmp_path / "x.nc")
+    (tmp_path / "x.nc").write_bytes(netcdf_bytes(data_tree(bare)))
     assert _groups(arviz.from_netcdf(str(tmp_path / "x.nc"))) == {"posterior", "sample_stats"}
 
 
 def test_exact_members_join_their_family(result: Result, tmp_path: Path) -> None:
     fixed = {"k2[rigid]": 1e6}
-    write_posterior(dataclasses.replace(result, fixed=fixed), tmp_path / "x.nc")
+    (tmp_path / "x.nc").write_bytes(netcdf_bytes(data_tree(dataclasses.replace(result, fixed=fixed))))
     with xr.open_dataset(tmp_path / "x.nc", group="posterior", engine="h5netcdf") as data:
         assert list(data["spring"].values) == ["soft", "medium", "stiff", "rigid"]
         assert np.all(data["k2"].sel(spring="rigid") == 1e6)
         assert "fixed" not in data["k2"].attrs
 
 
-def test_netcdf_refusals(result: Result, unsampled: Result, tmp_path: Path) -> None:
+def test_netcdf_refusals(result: Result, unsampled: Result) -> None:
     with pytest.raises(ValueError, match="nothing was sampled"):
-        write_posterior(unsampled, tmp_path / "x.nc")
+        data_tree(unsampled)
     clash = dataclasses.replace(result, fixed={"k2": 1.0})
     with pytest.raises(ValueError, match=re.escape("k2 is used both alone and as a family")):
-        write_posterior(clash, tmp_path / "x.nc")
+        data_tree(clash)
 
 
 @pytest.mark.benchmark
@@ -357,10 +360,10 @@ def test_writing_is_quick(maker: Callable[..., Result], tmp_path: Path) -> None:
     from time import process_time
 
     result = maker(draws=250, walkers=64)
-    write_posterior(result, tmp_path / "warm.nc")
+    (tmp_path / "warm.nc").write_bytes(netcdf_bytes(data_tree(result)))
     start = process_time()
-    write_posterior(result, tmp_path / "x.nc")
+    (tmp_path / "x.nc").write_bytes(netcdf_bytes(data_tree(result)))
     assert process_time() - start < 0.5
     start = process_time()
-    write_result(result, tmp_path)
+    write_result(result_files(result), tmp_path)
     assert process_time() - start < 2.5

@@ -37,6 +37,8 @@ TOML_FAULTS = [
     ("m1 = { value = 110", "m1 = { value = ‸nan", "m1 must be a finite number"),
     ("m1 = { value = 110", "m1 = { value = ‸inf", "m1 must be a finite number"),
     ("m1 = { value = 110", "m1 = { value = ‸1e999", "m1 must be a finite number"),
+    ("m1 = { value = 110", "m1 = { value = ‸1_1e-400", "a number must be one that float64 holds, 1_1e-400, write 0"),
+    ("sd = 0.5", "sd = ‸1e-400", "a number must be one that float64 holds"),  # 0 is a standard deviation
     ("m1 = { value = 110", "m1 = { value = ‸0x" + "f" * 5000, "m1 must be a finite number"),
     ("m1 = { value = 110,", "m1 = ‸{", "m1 must have a value"),
     ("m1 = { value = 110, sd = 0.5", "m1 = { value = 110, sd = ‸-0.5", "sd of m1 must be 0 or greater"),

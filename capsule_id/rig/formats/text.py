@@ -24,6 +24,9 @@ from capsule_id.views import counted
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
+# A number may be below the smallest float64 where it has such an exponent.
+_TINY = re.compile(rb"[eE]-0*(?:[1-9][0-9]{3}|[3-9][0-9]{2})")
+_LONGEST_MANTISSA = 400  # characters
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
 _LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
@@ -89,16 +92,27 @@ def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> 
             line,
             column,
         )
-    if not np.isfinite(value):
-        raise InputError(
-            "a cell must be a finite number",
-            shown_cell(cell),
-            "write a smaller number: float64 ends at 1.8e308",
-            path,
-            line,
-            column,
-        )
+    if is_beyond_floats(value, cell):
+        rule, remedy = ("finite number", "a smaller number: float64 ends at 1.8e308")
+        if value == 0.0:
+            rule, remedy = "number that float64 holds", "0: float64 begins at 5e-324"
+        raise InputError(f"a cell must be a {rule}", shown_cell(cell), f"write {remedy}", path, line, column)
     return value
+
+
+def is_beyond_floats(value: float, written: str) -> bool:
+    """Whether ``value``, read from ``written``, is infinite, or 0 where another number is written."""
+    return not np.isfinite(value) or (value == 0.0 and re.search("[1-9]", re.split("[eE]", written)[0]) is not None)
+
+
+def _holds_lost_number(text: bytes) -> bool:
+    """Whether a number of ``text``, with decimal points, is not 0, and 0 as a float64."""
+    for found in _TINY.finditer(text):
+        before = text[max(found.start() - _LONGEST_MANTISSA, 0) : found.start()]
+        mantissa = before[len(before.rstrip(b"0123456789.")) :]
+        if mantissa.strip(b"0.") and float(mantissa + found[0]) == 0.0:
+            return True
+    return False
 
 
 def decimal_mark(texts: Sequence[str], missing: Sequence[str]) -> str | None:
@@ -133,7 +147,8 @@ def read_column(
     if (_NUMBER_CHARACTERS | {mark}).issuperset("".join([texts[k] for k in used])):  # quickly, where all are numbers
         with suppress(ValueError):
             values[used] = [float(texts[k].replace(mark, ".")) for k in used]
-            if np.isfinite(values[used]).all():
+            lost = not values[used].all() and _holds_lost_number("\n".join(texts).replace(mark, ".").encode())
+            if np.isfinite(values[used]).all() and not lost:
                 return values
     for k, text in enumerate(texts):
         if text in missing:
@@ -146,7 +161,7 @@ def read_column(
                 f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row",
                 *place(k),
             )
-        values[k] = value if np.isfinite(value) else read_number(text, mark, *place(k))
+        values[k] = read_number(text, mark, *place(k)) if is_beyond_floats(value, text) else value
     return values
 
 
@@ -251,8 +266,11 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     if delimiter is not None and occurrences(delimiter, text) != count * (shape.width - 1 + shape.trailing):
         return None
     used = list(range(shape.width)) if delimiter is None else sorted({*columns, shape.width - 1})
-    values = _parse(text.replace(b",", b".") if decimal == "," else text, delimiter, used)
+    text = text.replace(b",", b".") if decimal == "," else text
+    values = _parse(text, delimiter, used)
     if values is None or values.shape != (count, len(used)) or not np.isfinite(values).all():
+        return None
+    if not values.all() and _holds_lost_number(text):
         return None
     return values[:, np.searchsorted(used, columns)]
 

@@ -40,6 +40,7 @@ TEXTS = [
     "".join(f"{k},{k % 7}\n" for k in [*range(60), 3]),
     "no numbers at all\nnor here\n",
     "t,x\n0,1e400\n1,2\n",
+    "t,x\n0,1\n1,0.2E-0400\n2,0e-400\n",
     "t,x\n0,1\n1,2 3\n",
     "t,x µm\n0,1\n1,nan\n2,3\n",
     "0,1.5\n" * 40 + "0,x\n",
@@ -203,3 +204,16 @@ def test_memory_is_a_small_multiple_of_the_file(tmp_path: Path) -> None:
     tracemalloc.stop()
     assert len(export.values(0)) == count
     assert peak < 3.0 * path.stat().st_size
+
+
+@pytest.mark.parametrize("written", ["1e-400", "-0.02E-0500", "1e-324", "0,3e-400"])
+@pytest.mark.parametrize("layout", [None, Layout(), Layout(missing=("--",))])
+def test_a_number_below_the_smallest_float_is_named(written: str, layout: Layout | None) -> None:
+    """Before, it was read as 0, in whichever way the text is read; a 0 with an exponent stays one."""
+    mark = "," if "," in written else "."
+    text = f"t [s];x [mm]\n0;1{mark}5\n1;{{}}\n2;3{mark}5\n"
+    (error,) = {line for line in outcome(text.format(written), ".csv", layout) if "float64" in line}
+    assert error.startswith("f.csv:3:3: a cell must be a number that float64 holds")
+    assert error.endswith("write 0: float64 begins at 5e-324")
+    for kept in (f"0{mark}00e-400", "5e-324"):
+        assert "float64" not in str(outcome(text.format(kept), ".csv", layout))
