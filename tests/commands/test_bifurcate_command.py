@@ -110,6 +110,7 @@ def _posterior(path: Path, draws: int = 6) -> dict[str, np.ndarray]:
     return drawn | {"k2": k2}
 
 
+@pytest.mark.full
 def test_posterior_bands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drawn = _posterior(tmp_path / "posterior.nc")
     axis = ["--over", "P_d", "--from", "3", "--to", "4.5", "--points", "3", "--posterior", "posterior.nc"]

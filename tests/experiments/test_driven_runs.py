@@ -92,6 +92,7 @@ def test_the_growth_of_initial_errors_is_that_of_the_motion_under_the_same_pulse
     assert growth(run, {**TRUTH, **own}) == pytest.approx(np.linalg.norm(columns, 2), rel=1e-3)
 
 
+@pytest.mark.full
 def test_a_later_part_of_a_record_has_the_pulses_of_the_whole(tmp_path: Path) -> None:
     """All parts share the phase, which counts from the first sample of the record."""
     drive = Pulses(6.0, PERIOD, DUTY, phase=PHASE, lag=LAG)

@@ -69,6 +69,7 @@ def test_chaos_has_a_positive_exponent_which_is_the_rate_at_which_neighbours_par
     assert seen.lyapunov[0] == pytest.approx(rate, rel=0.35)
 
 
+@pytest.mark.full
 def test_periodic_and_failed_motions_carry_no_exponent_and_say_why() -> None:
     p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=2e4, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
     r = response(p, Excitation(4.0, 34.56))

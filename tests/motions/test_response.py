@@ -118,6 +118,7 @@ def test_contacts_parted_by_less_than_the_stated_time_are_one(cases: Cases) -> N
         response(p, e, settling=Settling(merge_contacts=0.6 * T))
 
 
+@pytest.mark.full
 def test_work_of_the_drive_is_what_damper_and_friction_take(cases: Cases) -> None:
     """Over a period of a periodic motion nothing is stored; the dissipation comes from another quadrature."""
     seen = settle(cases.p, cases.e)

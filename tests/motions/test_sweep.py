@@ -138,6 +138,7 @@ def test_two_parameter_map_is_its_points_and_goes_through_a_file(tmp_path: Path)
             assert read[name].attrs == dict(zip(("units", "long_name"), MOTION_COLUMNS[str(name)], strict=True))
 
 
+@pytest.mark.full
 def test_a_run_that_is_given_up_says_so_and_disturbs_no_other() -> None:
     k2 = np.array([18960.0, -1.0, 51050.0])
     broken = diagram(P, E, "k2", k2, settling=QUICK)

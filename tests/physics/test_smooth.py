@@ -58,6 +58,7 @@ def test_every_period_end_approaches_the_exact_state(cases: Cases) -> None:
     assert error[2] < 5e-6
 
 
+@pytest.mark.full
 def test_order_of_the_smoothing(cases: Cases) -> None:
     coarse = replace(FINE, tolerance=1e-6)
     velocity = [replace(coarse, velocity=width) for width in np.geomspace(1e-3, 1e-2, 4)]

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.models import decay_frequency
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
     DAMPING,
@@ -17,6 +16,7 @@ from capsule_id.experiments.free_vibration.readings import (
     DecayModel,
     DecaySettings,
     block_size,
+    decay_frequency,
     decay_window,
     default_block_size,
     first_periods,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from capsule_id.records.tones import frequency_of, length_of_motion, noise_level
+from capsule_id.records.tones import length_of_motion, noise_level
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.views import Facts
 
@@ -123,6 +123,12 @@ class HalfCycles(NamedTuple):
     positions: Any
     velocities: Any
     accelerations: Any
+
+
+def most_half_cycles(duration: float, omega: float) -> int:
+    """Bound on the half cycles of a decay: a quarter more than at its rough frequency ``omega``, rad/s, and at most 50 more."""
+    number = omega * duration / np.pi
+    return int(number + min(0.25 * number, 50.0)) + 5
 
 
 def steps_of(number: int) -> int:
@@ -304,8 +310,6 @@ LIGHT_RATIOS, STRONG_RATIOS = (0.001, 0.01, 0.03, 0.1), (0.2, 0.4, 0.7, 1.0, 1.5
 SMALLEST_RATIO, LARGEST_SEARCHED, LARGEST_RATIO = 1e-6, 30.0, 0.9
 #: Unknowns of a viscous decay: k1, c, two initial conditions, offset.
 UNKNOWNS = 5
-#: Spectra with fewer periods are checked by a fit; its damping ratio beyond which a spectrum may have no peak.
-FEW_PERIODS, PEAKLESS = 4.0, 0.3
 #: Smallest distance from rest of a swing, relative to the record's range.
 SMALLEST_SWING = 0.05
 #: Samples that are searched: at least, at most on the grid, and at most in the refinement.
@@ -508,15 +512,6 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, held: int | None = None) -
         for z in starts
     ]
     return fitted(min(ends, key=lambda one: one.cost).x, slice(None))
-
-
-def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:
-    """Dominant frequency of a decay, Hz; where its spectrum has no peak because of strong damping, omega_0 of a fit."""
-    frequency = frequency_of(time, values)
-    if frequency * float(time[-1] - time[0]) > FEW_PERIODS:
-        return frequency
-    found = viscous_fit(time, values)
-    return found.omega / (2.0 * np.pi) if found.ratio > PEAKLESS else frequency
 
 
 def exponential_fit(time: np.ndarray, values: np.ndarray) -> ViscousFit:

@@ -41,6 +41,7 @@ from capsule_id.experiments.free_vibration.models import (
     equilibrium,
     fold,
     logarithmic_decrement,
+    most_half_cycles,
     rates,
     steps_of,
     trend,
@@ -384,7 +385,7 @@ class DecayRecord(Decay):
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side = float(np.sign(self.first_turning_point()[1]))
         # The margin allows for a frequency 1.25 times the rough estimate.
-        self.half_cycles = 0 if self.closed else int(1.25 * self.rough.Omega_o * float(self.time[-1]) / np.pi) + 5
+        self.half_cycles = 0 if self.closed else most_half_cycles(float(self.time[-1]), self.rough.Omega_o)
         self.clock_rate = stated_rate(table)
         self.about = replace(self.about, parameters=(*self._rows(), *clock_parameters(table, rig)))
 

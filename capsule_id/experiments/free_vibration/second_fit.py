@@ -24,6 +24,7 @@ from capsule_id.experiments.free_vibration.models import (
     equilibrium,
     half_cycles,
     interpolate,
+    most_half_cycles,
     steps_of,
     viscous_fit,
 )
@@ -222,8 +223,7 @@ class Screening:
         blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
         self.values, self.nodes, self.weights = blocks.values, blocks.nodes, blocks.weights
         self.times = ReadingTimes.of(blocks)
-        # The margin allows for a frequency 1.25 times the rough estimate.
-        self.number = int(2.5 * float(record.time[-1]) / self.period) + 5
+        self.number = most_half_cycles(float(record.time[-1]), self.omega)
         self.units = natural_units(self.k1, self.m1, self.size) | {
             "k1": self.k1,
             "c": self.c,
@@ -418,6 +418,8 @@ class Screening:
 READINGS_PER_PERIOD = 16
 #: Fewest readings per period of a thinned record, and in all of it.
 FEWEST_PER_PERIOD, FEWEST_READINGS = 8, 80
+#: Models are ranked by the first periods of a record: more of them take longer and change no decision.
+RANKED_PERIODS = 100
 #: Largest number of samples of a record that is no free decay.
 LONGEST_UNCUT = 1000
 #: Of forces whose BIC differs by less, the fewest are chosen: with seven alternatives, noise alone often gains this much.
@@ -683,9 +685,11 @@ def _demanded(records: list[DecayRecord], level: float) -> Demanded:
     contradicting = [e.label for e in records if e.n >= SHORTEST and demands_another(e, level)]
     if not contradicting:
         return Demanded((), records, {})
-    own = [e.with_table(first_periods(e.table)) for e in records]
-    ranking = demanded_model(own)
-    text = _drift_text(own, ranking)
+    own, ranked = (
+        [e.with_table(first_periods(e.table, most)) for e in records] for most in (MOST_PERIODS, RANKED_PERIODS)
+    )
+    ranking = demanded_model(ranked)
+    text = _drift_text(ranked, ranking)
     if ranking.model.slow and any(part.n < whole.n for part, whole in zip(own, records, strict=True)):
         text += f" The second fit uses the first {MOST_PERIODS} periods of each record."
     kept = own if ranking.model.slow else records
