@@ -272,8 +272,7 @@ class MarginalPosterior:
     @property
     def work(self) -> int:
         """Time of an evaluation in units of that of one reading; 1 where it integrates motions of the capsule."""
-        experiments = self.target.experiments
-        return 1 if any(e.event_driven for e in experiments) else max(1, sum(e.work for e in experiments))
+        return self.target.work
 
     @property
     def can_be_emulated(self) -> bool:
@@ -442,7 +441,7 @@ def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: 
     Logarithms of: terms without scatters (w, blocks); densities of t at the nodes (w, scatters, nodes), see
     ``capsule_id.inference.marginal``; their integrals (w, scatters).
     """
-    return jax.vmap(partial(_conditional, layout, target, bend))(v, start, step)
+    return target.by_rows(partial(_conditional, layout, target, bend), v, start, step)
 
 
 def _conditional(

@@ -20,6 +20,9 @@ from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
 from capsule_id.precision import COMPILE
 from capsule_id.rig.model import Rig
 
+#: Rows that are evaluated together where each takes more than this work, in readings: more would leave the caches.
+ROWS_TOGETHER, HEAVY = 8, 30_000
+
 # scales: Scatters of which only the product with other parameters changes the motion.
 
 
@@ -459,6 +462,18 @@ class LogPosterior(eqx.Module):
         parts = [np.asarray(e.residuals(e.local(values), np)) for e in self.experiments]
         return np.concatenate([*parts, self.prior_residuals(u)])
 
+    @property
+    def work(self) -> int:
+        """Time of an evaluation in units of that of one reading; 1 where it integrates motions of the capsule."""
+        motions = any(e.event_driven for e in self.experiments)
+        return 1 if motions else max(1, sum(e.work for e in self.experiments))
+
+    def by_rows(self, function: Callable[..., Any], *columns: Any) -> Any:
+        """``function`` of every row of ``columns`` (w, ...); where a row takes long, of a few rows at a time."""
+        if self.work < HEAVY:
+            return jax.vmap(function)(*columns)
+        return jax.lax.map(lambda row: function(*row), columns, batch_size=ROWS_TOGETHER)
+
     def _per_group(self, function: Callable[[Experiment, ValuesBySymbol], Any], u: Any) -> list[Any]:
         """Evaluate ``function`` for every experiment, batched: one array (members, ...) per group."""
         values = self.constrain(u)
@@ -506,7 +521,7 @@ class LogPosterior(eqx.Module):
 
 @partial(jax.jit, compiler_options=COMPILE)
 def _batch(target: LogPosterior, u: Any) -> Any:
-    return jax.vmap(target)(u)
+    return target.by_rows(target, u)
 
 
 class HeldResiduals(eqx.Module):
