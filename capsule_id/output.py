@@ -17,7 +17,7 @@ from capsule_id.errors import InputError, OutputError, refusing, writing
 RESULT_FILES = frozenset({"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"})
 STATE, CHAINS, NEW = "state.json", "chains.saved", ".new"
 #: Additional files of an unfinished run.
-WORK_FILES = frozenset({STATE, STATE + NEW, CHAINS, CHAINS + NEW})
+WORK_FILES = frozenset({STATE, STATE + NEW, CHAINS, CHAINS + NEW, "chains.h5"})  # the last: of versions before
 #: The lock stands beside ``DIR.partial``: Windows renames no directory with an open file.
 PARTIAL, OLD, LOCK = ".partial", ".partial.old", ".partial.lock"
 _writable = partial(refusing, "the output directory must be writable", "choose another --out")
@@ -214,10 +214,10 @@ def _recover(directory: Path) -> None:
     old = _old(directory)
     if not old.exists():
         return
-    if directory.exists() or not _is_result(old):
+    if directory.exists():
         with refusing("an older result must be removable", "move it away", old):
             shutil.rmtree(old)
-    else:
+    elif _is_result(old):
         old.rename(directory)
 
 

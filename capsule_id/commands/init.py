@@ -107,10 +107,15 @@ def run(args: argparse.Namespace) -> int:
         name = folder.resolve().name
         usable = re.fullmatch(NAME_PATTERN, name) and name.strip(".")
         text = template(kinds, name if usable else "rig", [entry for entry, _ in guesses.values()])
-        (folder / "rig.toml").write_text(text, encoding="utf-8", newline="\n")
-        for file, content in contents.items():
-            if (folder / file).resolve() not in own:
-                (folder / file).write_bytes(content)
+        contents = {"rig.toml": text.encode(), **contents}
+        made = [file for file in contents if (folder / file).resolve() not in own]
+        try:
+            for file in made:
+                (folder / file).write_bytes(contents[file])
+        except OSError:  # a part of a table would be read as a table
+            for file in made:
+                (folder / file).unlink(missing_ok=True)
+            raise
     if not files:
         say(
             f"wrote {folder / 'rig.toml'}: add tables, remove the `# ` of their entries, then run capsule-id check {folder}"

@@ -226,7 +226,7 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
     from capsule_id.report.write import result_files
 
     try:
-        result = make_fit(rig, options, kinds or default_registry())
+        result = make_fit(rig, options, kinds or default_registry(), None, lambda *_: None)
     except KeyboardInterrupt:
         raise RuntimeError("interrupted") from None
     changes = "".join(f"\n{line}" for line in wrapped(result.remarks))

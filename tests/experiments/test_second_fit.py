@@ -156,6 +156,21 @@ def test_coloured_noise_is_quoted_from_fewer_readings_that_tell_as_much() -> Non
         assert abs(few.values[name] - all_of_them.values[name]) < 0.2 * all_of_them.errors[name]
 
 
+def test_records_of_two_sampling_rates_keep_readings_in_every_period() -> None:
+    """Noise of a correlation time that both records show. (Before: the block of the faster one left 0.5 a period.)"""
+    made = []
+    for label, rate, seed in (("fast", 8000.0, 1), ("slow", 400.0, 2)):
+        time, rng = np.arange(round(0.5 * rate)) / rate, np.random.default_rng(seed)
+        rho = np.exp(-1.0 / (rate * 0.01))
+        noise = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal(len(time)))
+        x = np.asarray(decay(time, {"k1": bench.K1, "c": C, "m1": bench.M1}, RELEASE, 0.0, 30).x_rel)
+        columns = [bench.column("time", time), bench.column("x_rel", x + 10.0 * NOISE * noise)]
+        made.append(bench.table("free_vibration", columns, label))
+    rig = bench.rig(*made)
+    for second in second_models([FreeVibration(table, rig) for table in made])[0]:
+        assert second.n >= 80
+
+
 @pytest.mark.full
 def test_the_lines_of_the_finding_state_the_quoted_model() -> None:
     (second,), (finding,) = second_models([record(0.0, DRY)])

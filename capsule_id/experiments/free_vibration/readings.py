@@ -9,7 +9,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, phasor
-from capsule_id.records.release import FreeDecay, find_free_decay
+from capsule_id.records.release import FreeDecay, find_free_decay, shortened
 from capsule_id.records.tones import frequency_of
 from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
@@ -196,11 +196,11 @@ FEW_PERIODS, PEAKLESS = 4.0, 0.3
 def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:
     """Dominant frequency of a decay, Hz; where its spectrum has no peak because of strong damping, omega_0 of a fit."""
     frequency = frequency_of(time, values)
-    if frequency * float(time[-1] - time[0]) > FEW_PERIODS:
+    if frequency * float(time[-1] - time[0]) > FEW_PERIODS or np.ptp(values) == 0.0:
         return frequency
     from capsule_id.experiments.free_vibration.models import viscous_fit  # loads JAX, which few records need here
 
-    found = viscous_fit(time, values)
+    found = viscous_fit(*shortened(time, values))
     return found.omega / (2.0 * np.pi) if found.ratio > PEAKLESS else frequency
 
 
@@ -436,10 +436,10 @@ def stated_model(table: Table) -> DecayModel:
     return replace(model, thin=default_block_size(*decay_window(table)))
 
 
-def first_periods(table: Table[DecaySettings], most: int = MOST_PERIODS) -> Table[DecaySettings]:
-    """Return the table with a stop after ``most`` periods, where none is stated and the record is longer."""
+def first_periods(table: Table[DecaySettings]) -> Table[DecaySettings]:
+    """Return the table with a stop after ``MOST_PERIODS``, where none is stated and the record is longer."""
     time, values = decay_window(table)
-    last = most * block_size(time, values, 1.0)
+    last = MOST_PERIODS * block_size(time, values, 1.0)
     if table.settings.stop is not None or last >= len(time) or block_size(time, values, 1.0) == 1:
         return table
     return replace(table, settings=replace(table.settings, stop=float(time[last])))

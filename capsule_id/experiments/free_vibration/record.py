@@ -384,7 +384,6 @@ class DecayRecord(Decay):
         self.step = step or 0.0
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side = float(np.sign(self.first_turning_point()[1]))
-        # The margin allows for a frequency 1.25 times the rough estimate.
         self.half_cycles = 0 if self.closed else most_half_cycles(float(self.time[-1]), self.rough.Omega_o)
         self.clock_rate = stated_rate(table)
         self.about = replace(self.about, parameters=(*self._rows(), *clock_parameters(table, rig)))

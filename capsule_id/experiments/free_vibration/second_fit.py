@@ -418,8 +418,6 @@ class Screening:
 READINGS_PER_PERIOD = 16
 #: Fewest readings per period of a thinned record, and in all of it.
 FEWEST_PER_PERIOD, FEWEST_READINGS = 8, 80
-#: Models are ranked by the first periods of a record: more of them take longer and change no decision.
-RANKED_PERIODS = 100
 #: Largest number of samples of a record that is no free decay.
 LONGEST_UNCUT = 1000
 #: Of forces whose BIC differs by less, the fewest are chosen: with seven alternatives, noise alone often gains this much.
@@ -544,13 +542,13 @@ def simplest(ranked: Sequence[Ranking]) -> Ranking:
 
 
 def demanded_model(records: Sequence[DecayRecord]) -> Ranking:
-    """Return the model with the lowest BIC of all ``records`` together, thinned until its residuals are white.
+    """Return the model with the lowest BIC of all ``records`` together, thinned where its noise is coloured.
 
     The forces are chosen first on thinned records, with the richest noise that the settings leave open, then drift and
     noise. The fits of fewer forces become starts of the quoted fit.
     """
     forces, others = open_models(records[0])
-    coarse = thinning(records[0], READINGS_PER_PERIOD)
+    coarse = min(thinning(record, READINGS_PER_PERIOD) for record in records)
     thinned = [Screening(record, coarse) for record in records]
     by_forces = rank(thinned, [replace(model, noise=others[-1].noise) for model in forces])
     best = simplest(by_forces)
@@ -574,15 +572,15 @@ def _with_noise(
     """
     best = ranked[0]
     if records[0].table.settings.thin is not None:
-        return best
-    thin, fewest = coarse, max(coarse, thinning(records[0], FEWEST_PER_PERIOD))
+        return rank([Screening(record) for record in records], [best.model], best)[0]
+    thin, fewest = coarse, max(coarse, min(thinning(record, FEWEST_PER_PERIOD) for record in records))
     if not any(one.white for one in ranked) and fewest > coarse:
         thin, ranked = fewest, rank([Screening(record, fewest) for record in records], others, best)
     chosen = next((one for one in ranked if one.white), None)
     if chosen is None:
         return replace(best, model=replace(best.model, thin=coarse))
     if not chosen.model.whitened:
-        whole = rank([Screening(record) for record in records], [chosen.model], chosen)[0]
+        whole = rank([Screening(record, chosen.model.thin) for record in records], [chosen.model], chosen)[0]
         if whole.white:
             return whole
     return replace(chosen, model=replace(chosen.model, thin=thin))
@@ -685,11 +683,9 @@ def _demanded(records: list[DecayRecord], level: float) -> Demanded:
     contradicting = [e.label for e in records if e.n >= SHORTEST and demands_another(e, level)]
     if not contradicting:
         return Demanded((), records, {})
-    own, ranked = (
-        [e.with_table(first_periods(e.table, most)) for e in records] for most in (MOST_PERIODS, RANKED_PERIODS)
-    )
-    ranking = demanded_model(ranked)
-    text = _drift_text(ranked, ranking)
+    own = [e.with_table(first_periods(e.table)) for e in records]
+    ranking = demanded_model(own)
+    text = _drift_text(own, ranking)
     if ranking.model.slow and any(part.n < whole.n for part, whole in zip(own, records, strict=True)):
         text += f" The second fit uses the first {MOST_PERIODS} periods of each record."
     kept = own if ranking.model.slow else records

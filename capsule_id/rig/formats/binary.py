@@ -95,7 +95,8 @@ LONGEST_READING, BYTES_PER_SECOND, SPARE_MEMORY = 8, 1 << 25, 1 << 29
 def _data_sets(content: bytes, path: Path) -> Named:
     """The data sets of an HDF5 file; their names are paths such as ``group/x``."""
     command = [sys.executable, "-P", "-c", f"from {__name__} import serve_hdf5; serve_hdf5()", path.name]
-    paths = os.pathsep.join(place for place in sys.path if place)
+    own = str(Path(__file__).parents[3])  # the package may be imported from the working folder
+    paths = os.pathsep.join(dict.fromkeys([*filter(None, sys.path), own]))
     threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # the memory of their stacks counts
     surroundings = {**os.environ, **threads, "PYTHONPATH": paths}
     # In a session of its own Ctrl-C reaches this process alone.
@@ -141,8 +142,9 @@ def serve_hdf5() -> None:
         with suppress(ImportError):  # Windows has no such limits; the time is limited by the process that waits
             resource: Any = import_module("resource")
             most = 2 * len(content) + 4 * largest(content) + SPARE_MEMORY
-            resource.setrlimit(resource.RLIMIT_AS, (most, most))
-            resource.setrlimit(resource.RLIMIT_CPU, (_longest(content), _longest(content)))
+            for kind, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, _longest(content))):
+                with suppress(ValueError, OSError):  # a lower limit holds already, or the system has none of this kind
+                    resource.setrlimit(kind, (limit, limit))
         with complete(path, "export it again"):
             for name, array, unit in _read_data_sets(content, path):
                 out.write(json.dumps([name, array.dtype.str, array.shape, unit, None]).encode() + b"\n")
@@ -171,6 +173,8 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
         file.visititems_links(links.__setitem__)
         for name, link in links.items():
             found = file[name] if isinstance(link, h5py.HardLink) else link
+            if isinstance(found, h5py.Dataset) and found.ndim > 2:
+                continue
             for feature in _unreadable(found):
                 rule = f"a {path.suffix} file must hold its readings itself, by filters of the HDF5 library"
                 raise InputError(

@@ -25,6 +25,8 @@ Content = bytes | Path
 LARGEST_CONTENT, SMALL_CONTENT, SPREAD = 1 << 30, 1 << 26, 10
 #: Bytes that a reading counts: a text needs two to ten.
 READING = 4
+#: Most series of readings in one array.
+MOST_SERIES = 200
 #: Longest line of a text, bytes; most columns of a table; most lines above its rows of numbers.
 LONGEST_LINE, MOST_COLUMNS, MOST_TITLES = 1 << 18, 2_000, 10_000
 
@@ -402,17 +404,20 @@ def export_of_arrays(
         If there is no column.
     """
     refuse_line(layout, path)
-    columns, stated = {}, []
+    columns, stated, widest = {}, [], 0
     for name, array in arrays.items():
         if array.size and name.isprintable() and array.ndim in (1, 2):
             own = {name: array.ravel()}
             if array.ndim == 2 and 1 not in array.shape:
+                if min(array.shape) > MOST_SERIES:  # an image, or a covariance: no series of readings
+                    widest = max(widest, *array.shape)
+                    continue
                 rows = array.shape[1] > WIDE * array.shape[0]
                 form = "({},:)" if rows else "(:,{})"
                 own = {name + form.format(i + 1): one for i, one in enumerate(array if rows else array.T)}
             columns |= own
             stated += [(units or {}).get(name, "")] * len(own)
-    refuse_wide(len(columns), path)
+    refuse_wide(len(columns) or widest, path)
     if not columns:
         raise InputError(
             f"a {path.suffix} file must hold real numeric vectors", "none", "export the readings as vectors", path
