@@ -1,5 +1,6 @@
 """Joint fit of all experiments: its starts, its second fits, and the stage of the pipeline that runs it."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -349,8 +350,9 @@ def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
     groups += [found for found in [_joint_scatters(target, u)] if len(found[0])]
     modes: dict[int, float] = {}
     for members, density in groups:
-        # The line search may try sizes that have no finite density.
-        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        # The line search may try sizes that have no finite density, and rounding may end it at the maximum.
+        with warnings.catch_warnings(), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
             found = minimize(lambda t, density=density: -density(t), u[members], method="BFGS").x
         modes |= dict(zip(members.tolist(), found.tolist(), strict=True))
     return modes

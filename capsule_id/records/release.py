@@ -131,8 +131,11 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
         after = turns[time[turns] > start + 0.15 * period]  # the first leg of a record is not whole
         stop = _growth(time, values, after) if stop is None and len(after) > 4 else stop
         own, halves = 2.0 * np.pi / (fit.poles[0] * np.sqrt(max(1.0 - fit.poles[1] ** 2, 0.1))), np.diff(time[after])
-        if len(after) > 4:
-            own = 2.0 * float(np.mean(halves[np.abs(halves / np.median(halves) - 1.0) < REGULAR]))
+        regular = (
+            halves[np.abs(halves - np.median(halves)) < REGULAR * np.median(halves)] if len(after) > 4 else halves[:0]
+        )
+        if len(regular):
+            own = 2.0 * float(np.mean(regular))
         decay = FreeDecay(start, stop, start - float(time[0]), own, pushed)
     slow = int(np.searchsorted(time, over, "right"))
     later = time[slow + _turning_points(values[slow:])] if len(time) - slow > WINDOW else time[:0]

@@ -478,7 +478,7 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, held: int | None = None) -
     held : fit a single stroke instead, after which dry friction holds the rod, to this derivative of x_rel; the time of
         its stop is searched too
     """
-    time, size = time - time[0], float(np.std(values))
+    time, size = time - time[0], float(np.std(values)) or 1.0
     rest = np.mean(values[-max(len(values) // 5, 4) :])
     end = max(2 * length_of_motion(values - rest), FEWEST_SEARCHED)
     length, step = float(time[:end][-1]), float(np.median(np.diff(time)))
