@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from capsule_id.experiments.progression.twin import RobotDesign as RobotDesign, synthesize_robot as synthesize_robot
     from capsule_id.importing import propose_entry as propose_entry
     from capsule_id.inference.compare import compare_models as compare_models, compare_points as compare_points
-    from capsule_id.motions.bias import smoothing_bias as smoothing_bias
     from capsule_id.motions.operating import draws_diagram as draws_diagram
     from capsule_id.motions.response import Response as Response, Settling as Settling, response as response
     from capsule_id.motions.sweep import continuation as continuation, diagram as diagram, motion_map as motion_map
@@ -67,7 +66,7 @@ if TYPE_CHECKING:
         Trajectory as Trajectory,
         status_message as status_message,
     )
-    from capsule_id.physics.simulation import simulate as simulate
+    from capsule_id.physics.simulation import simulate as simulate, smoothing_bias as smoothing_bias
     from capsule_id.physics.smooth.engine import Smoothing as Smoothing
     from capsule_id.synthetic import synthesize as synthesize
 
@@ -78,7 +77,6 @@ _PUBLIC = {
     "experiments.progression.twin": ("RobotDesign", "synthesize_robot"),
     "importing": ("propose_entry",),
     "inference.compare": ("compare_models", "compare_points"),
-    "motions.bias": ("smoothing_bias",),
     "motions.operating": ("draws_diagram",),
     "motions.response": ("Response", "Settling", "response"),
     "motions.sweep": ("continuation", "diagram", "motion_map"),
@@ -86,7 +84,7 @@ _PUBLIC = {
     "physics.drives": ("Pulses", "RecordedDrive", "RodMotion"),
     "physics.energy": ("energy_balance",),
     "physics.model": ("CapsuleParameters", "Status", "Trajectory", "status_message"),
-    "physics.simulation": ("simulate",),
+    "physics.simulation": ("simulate", "smoothing_bias"),
     "physics.smooth.engine": ("Smoothing",),
     "synthetic": ("synthesize",),
 }

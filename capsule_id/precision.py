@@ -21,7 +21,8 @@ def require_float64() -> None:
     import jax  # the options above are read by commands that load no JAX
 
     jax.config.update("jax_enable_x64", True)
-    dtype = jax.numpy.zeros(()).dtype
+    # Not by an array: the commands set XLA's options after this module's imports and before the first computation.
+    dtype = jax.dtypes.canonicalize_dtype(float)
     if dtype != jax.numpy.float64:
         raise RuntimeError(
             f"float64 is needed, JAX computes in {dtype}: leave the enclosing jax.enable_x64(False) block, "

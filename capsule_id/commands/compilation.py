@@ -1,6 +1,6 @@
 """Options of XLA and BLAS for a command, and the cache of compiled programs between commands.
 
-All act before JAX is imported, those of BLAS before NumPy.
+Those of XLA act before its first computation, those of BLAS before NumPy is imported.
 """
 
 import argparse
@@ -24,10 +24,9 @@ XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_thr
 XLA_EMITTER_OPTION = "--xla_cpu_use_fusion_emitters=false" if HAS_EMITTER_OPTION else ""
 #: Variable with the number of threads of OpenBLAS, which NumPy and SciPy bring.
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
-#: Programs that take longer than this to compile are kept, s.
-WORTH_KEEPING = 0.3
-#: Largest size of the cache, bytes; JAX removes the programs that were not used for the longest time.
-LARGEST_CACHE = 256 * 2**20
+#: Variables of JAX, unless the user has set them: largest size of the cache, bytes, beyond which it removes the programs that
+#: were not used for the longest time; programs that take longer than this to compile are kept, s.
+CACHE_SETTINGS = {"JAX_COMPILATION_CACHE_MAX_SIZE": 256 * 2**20, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": 0.3}
 #: Variable of JAX with the directory of the cache, and how JAX's warnings about the cache begin.
 DIRECTORY = "JAX_COMPILATION_CACHE_DIR"
 CACHE_ERRORS = tuple(f"Error {doing} persistent compilation cache entry" for doing in ("reading", "writing"))
@@ -44,13 +43,14 @@ def use_one_blas_thread() -> None:
 
 
 def prepare_jax(cached: bool, loop: bool = True) -> None:
-    """Set the options of XLA for this process, unless JAX is imported; those that the user has set stay.
+    """Set the options of XLA for this process, unless JAX has computed something; those that the user has set stay.
 
     cached : keep compiled programs in the user's cache directory too; JAX's own variables, where set, have precedence.
         Processes share the cache under a file lock. Nothing is kept where the directory cannot be written
     loop : set ``XLA_LOOP_OPTION`` too
     """
-    if "jax" in sys.modules:
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    if bridge is not None and getattr(bridge, "backends_are_initialized", lambda: True)():
         return
     for option in (XLA_EMITTER_OPTION, XLA_LOOP_OPTION)[: 1 + loop]:
         flags = os.environ.get("XLA_FLAGS", "")
@@ -62,9 +62,14 @@ def prepare_jax(cached: bool, loop: bool = True) -> None:
     with suppress(OSError):
         directory.mkdir(parents=True, exist_ok=True)
     if os.access(directory, os.W_OK | os.X_OK):
-        os.environ[DIRECTORY] = str(directory)
-        os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(LARGEST_CACHE))
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(WORTH_KEEPING))
+        settings = {DIRECTORY: str(directory), **CACHE_SETTINGS, **os.environ}
+        os.environ.update({name: str(settings[name]) for name in (DIRECTORY, *CACHE_SETTINGS)})
+        if "jax" in sys.modules:  # the kinds of experiments import it, and it has read its variables then
+            from jax import config
+
+            config.update(DIRECTORY.lower(), str(directory))
+            for name, value in CACHE_SETTINGS.items():
+                config.update(name.lower(), type(value)(os.environ[name]))
 
 
 def add_cache_argument(options: argparse._ActionsContainer) -> None:

@@ -8,12 +8,12 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.models import (
+from capsule_id.experiments.free_vibration.decrement import (
+    decay_frequency,
     exponential_fit,
     likelihood_gain,
     viscous_fit,
 )
-from capsule_id.experiments.free_vibration.readings import decay_frequency
 from capsule_id.experiments.free_vibration.second_fit import Screening, open_models, rank
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint

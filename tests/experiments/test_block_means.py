@@ -11,9 +11,10 @@ import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks import refit
+from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
-from capsule_id.experiments.free_vibration.models import Decrement, half_cycles, interpolate
+from capsule_id.experiments.free_vibration.models import half_cycles, interpolate
 from capsule_id.experiments.free_vibration.readings import (
     Blocks,
     DecayModel,

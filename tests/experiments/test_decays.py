@@ -10,7 +10,8 @@ import pytest
 from bench import K1, M1, C, released
 from scipy.integrate import solve_ivp
 
-from capsule_id.experiments.free_vibration.models import decay, decay_moments, fold, uniform_step, viscous_basis
+from capsule_id.experiments.free_vibration.decrement import viscous_basis
+from capsule_id.experiments.free_vibration.models import decay, decay_moments, fold, uniform_step
 from tests.capsule_cases import jit_quickly
 from tests.scipy_decay import scipy_decay
 

@@ -11,8 +11,8 @@ from scipy import ndimage, stats
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks import LEVEL, refit
 from capsule_id.experiments.context import Check, Fitted
+from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import sensitivities, zero_jumps
-from capsule_id.experiments.free_vibration.models import equilibrium
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
 from capsule_id.experiments.free_vibration.second_fit import Screening

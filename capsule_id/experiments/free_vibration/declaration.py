@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.lint import MESSAGES, check_thin, lint_decay
-from capsule_id.experiments.free_vibration.models import (
+from capsule_id.experiments.free_vibration.decrement import (
     STRONGEST,
     exponential_fit,
     likelihood_gain,
     swings_enough,
     viscous_fit,
 )
+from capsule_id.experiments.free_vibration.lint import MESSAGES, check_thin, lint_decay
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
     DecayModel,
@@ -60,7 +60,7 @@ def decay(
     rate: float = 2000.0,
 ) -> dict[str, np.ndarray]:
     """Simulate a decay from rest at ``release`` m at time 0; the noise sd is ``relative_sd`` of the release."""
-    from capsule_id.experiments.free_vibration.models import viscous_basis
+    from capsule_id.experiments.free_vibration.decrement import viscous_basis
 
     time = np.arange(round(duration * rate)) / rate
     x = release * viscous_basis(time, k1, c, m1, np)[:, 0]

@@ -10,7 +10,7 @@ from scipy.signal import lsim
 
 from capsule_id.experiments.base import ValuesBySymbol, stretch
 from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.free_vibration.models import STRONGEST, viscous_state
+from capsule_id.experiments.free_vibration.decrement import STRONGEST, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FURTHER,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
     DAMPING,
@@ -16,7 +17,6 @@ from capsule_id.experiments.free_vibration.readings import (
     DecayModel,
     DecaySettings,
     block_size,
-    decay_frequency,
     decay_window,
     default_block_size,
     first_periods,

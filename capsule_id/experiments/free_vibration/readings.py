@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, phasor
-from capsule_id.records.release import FreeDecay, find_free_decay, shortened
-from capsule_id.records.tones import frequency_of
+from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import COUNT, Entry, GroundSettings, NameRule, QuantityRule, WordsRule
@@ -187,21 +187,6 @@ def is_even(time: np.ndarray) -> bool:
     except InputError:
         return False
     return True
-
-
-#: Spectra with fewer periods are checked by a fit; its damping ratio beyond which a spectrum may have no peak.
-FEW_PERIODS, PEAKLESS = 4.0, 0.3
-
-
-def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:
-    """Dominant frequency of a decay, Hz; where its spectrum has no peak because of strong damping, omega_0 of a fit."""
-    frequency = frequency_of(time, values)
-    if frequency * float(time[-1] - time[0]) > FEW_PERIODS or np.ptp(values) == 0.0:
-        return frequency
-    from capsule_id.experiments.free_vibration.models import viscous_fit  # loads JAX, which few records need here
-
-    found = viscous_fit(*shortened(time, values))
-    return found.omega / (2.0 * np.pi) if found.ratio > PEAKLESS else frequency
 
 
 def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READINGS_PER_PERIOD) -> int:

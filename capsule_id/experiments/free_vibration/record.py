@@ -32,22 +32,24 @@ from capsule_id.experiments.free_vibration.declaration import (
     TURNING_TIME,
     WHITE_RATIO,
 )
-from capsule_id.experiments.free_vibration.models import (
+from capsule_id.experiments.free_vibration.decrement import (
     UNKNOWNS,
     Decrement,
     damping_of_peaks,
+    equilibrium,
+    logarithmic_decrement,
+    trend,
+    viscous_basis,
+    viscous_fit,
+)
+from capsule_id.experiments.free_vibration.models import (
     decay,
     decay_moments,
-    equilibrium,
     fold,
-    logarithmic_decrement,
     most_half_cycles,
     rates,
     steps_of,
-    trend,
     uniform_step,
-    viscous_basis,
-    viscous_fit,
 )
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,

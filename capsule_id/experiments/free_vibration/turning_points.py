@@ -15,13 +15,14 @@ from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters,
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.checks import each, halves
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
+from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.hidden_terms import (
     check_hidden_terms,
     further_sensitivities,
     open_forces,
     sensitivities,
 )
-from capsule_id.experiments.free_vibration.models import Decrement, half_cycles
+from capsule_id.experiments.free_vibration.models import half_cycles
 from capsule_id.experiments.free_vibration.readings import DecayModel, decay_window, further_parameters
 from capsule_id.experiments.free_vibration.record import Decay, DecayAbout, Screened
 from capsule_id.experiments.free_vibration.second_fit import Demanded, force_starts, replaced
