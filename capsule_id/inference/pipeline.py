@@ -255,8 +255,12 @@ def _pointwise(target: LogPosterior, posterior: Posterior, rng: np.random.Genera
     density, replicates = {}, {}
     for e in target.experiments:
         stop_if_interrupted()
-        with ThreadPoolExecutor() as pool:  # motions of forced runs take milliseconds
-            terms = list(pool.map(lambda v, e=e: e.left_out(e.local(v)), values))
+        local = [e.local(v) for v in values]
+        if e.event_driven:  # a motion takes milliseconds of compiled code; short calls would wait for each other
+            with ThreadPoolExecutor() as pool:
+                terms = list(pool.map(e.left_out, local))
+        else:
+            terms = [e.left_out(v) for v in local]
         density[e.label] = np.reshape(terms, (len(chain), len(draw), -1))
         replicates[e.label] = np.reshape([e.replicate(e.local(v), rng) for v in some], (*coarse, e.n))
     return Pointwise(density, {e.label: e.blocks for e in target.experiments}, replicates, chain, draw, thin)
