@@ -27,6 +27,9 @@ FURTHER = np.array([0.1, 0.2, 0.1])
 MODEL, MODEL_FURTHER, LARGEST_FURTHER = 0.003, 0.04, 0.3
 #: Cost of a sample before the release, and least evidence of a release, in variances of the noise.
 SAMPLE_COST, EVIDENCE = 6.0, 15.0
+#: Evidence below which no release is looked for where one viscous decay describes the whole record; fewest samples of its
+#: period, and steps to its poles.
+NO_EVIDENCE, WHOLE, WHOLE_STEPS = 5.0, 20.0, 5
 #: Residuals of a window that are this many times those of the windows within a period behind it show another motion.
 MISFIT = 1.5
 #: A decay with less damping oscillates; its windows grow by half a period, others by an eighth.
@@ -120,7 +123,7 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
             if first + LEGS < last
             else anchor
         )
-        begin, fit, stop = _release(record, anchor, early)
+        begin, fit, stop = _whole(record, anchor, lengths, sizes) or _release(record, anchor, early)
         over = float(record.time[begin]) + DIED_OUT / max(fit.poles[0] * fit.poles[1], 1e-9)
         start, pushed = float(time[0]), False
         if begin > 0 and np.sum(time >= record.time[begin]) > WINDOW // 4:
@@ -339,6 +342,48 @@ def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> n
             found = np.linalg.lstsq(columns, np.concatenate([values, np.zeros(3)]), rcond=1e-10)[0]
             x, v = columns[: len(phase), 1:] @ found[1:], rates @ found[:3] + rate @ found[3:]
     return np.column_stack([motions, phase * v, response(-2.0 * v[:, None])[0], further])
+
+
+def _whole(
+    record: _Record, begin: int, lengths: np.ndarray, sizes: np.ndarray
+) -> tuple[int, _Fit, float | None] | None:
+    """As ``_release``, where one viscous decay describes the record from its first sample on; None: it does not.
+
+    Without its first i samples the sum of squares is smaller by r' (1 - H)^-1 r, with their residuals r and their part H
+    of the projection on the unknowns. More than the noise and the cost of the samples would show a release.
+
+    Parameters
+    ----------
+    lengths, sizes : (l,) of the legs between turning points, s and as the readings
+    """
+    end = record.end(begin)
+    time, values, half = record.time[:end] - record.time[0], record.values[:end], float(np.median(lengths))
+    if len(lengths) < LEGS or 2.0 * half < WHOLE * float(np.max(np.diff(time))) or record.noise == 0.0:
+        return None
+    loss = float(np.log(sizes[1] / sizes[-1])) / max(len(sizes) - 2, 1)
+    omega, zeta = np.pi / half, float(np.clip(loss / np.hypot(np.pi, loss), 0.001, OSCILLATES))
+    for _ in range(WHOLE_STEPS):
+        motions, rates = _motions(omega * time, zeta)[:2]
+        parts = np.linalg.lstsq(motions, values, rcond=1e-9)[0]
+        by_zeta = (_motions(omega * time, zeta + 1e-5)[0] - motions) @ parts / 1e-5
+        projection = np.linalg.qr(np.column_stack([motions, omega * time * (rates @ parts), by_zeta]))
+        found = np.linalg.lstsq(projection.R, projection.Q.T @ values, rcond=1e-12)[0]
+        step = np.clip(found[3:], -0.2, 0.2)
+        omega, zeta = omega * float(np.exp(step[0])), float(np.clip(zeta + step[1], 1e-6, OSCILLATES))
+    left = (values - projection.Q @ (projection.Q.T @ values)) / record.noise
+    squares, few = np.cumsum(left**2), slice(len(left) // 2)
+    if squares[-1] > len(left) + 4.0 * np.sqrt(2.0 * len(left)) or np.max(np.abs(step)) > 0.01:
+        return None
+    q = projection.Q[few]
+    own, shared = np.cumsum(q * left[few, None], axis=0), np.cumsum(q[:, :, None] * q[:, None, :], axis=0)
+    less = squares[few] + np.sum(own * np.linalg.solve(np.eye(5) - shared, own[:, :, None])[..., 0], axis=1)
+    if np.max(less - SAMPLE_COST * np.arange(1, len(less) + 1)) > NO_EVIDENCE:
+        return None
+    return (
+        0,
+        _Fit((omega, zeta), float(squares[-1]) * record.noise**2, record.noise, record.noise, float(found[0])),
+        None,
+    )
 
 
 def _release(record: _Record, begin: int, early: int) -> tuple[int, _Fit, float | None]:
