@@ -32,8 +32,9 @@ from capsule_id.views import Comparison, Facts, Finding
 
 require_float64()
 
-#: Terms of a record in the leave-one-out density. A stretch of a sixtieth of a record seldom decides a parameter.
-BLOCKS = 60
+#: Terms of a record in the leave-one-out density, and most terms of a table. A stretch of a sixtieth of a record seldom
+#: decides a parameter; nor does one of a thousand rows, and each term holds a density for each of a thousand draws.
+BLOCKS, MOST_TERMS = 60, 1000
 
 #: Parameter values and constants of one experiment, SI, by *symbol* (``k1``, ``k2``, ``noise_sd``, ``g``, ``m1``).
 #: ``Experiment.local`` makes it from values by name (``k2[soft]``, ``noise_sd[decay_1]``).
@@ -244,8 +245,8 @@ class Experiment(eqx.Module):
 
     @property
     def blocks(self) -> np.ndarray:
-        """(blocks,) first reading of every term of the leave-one-out density: a row of a table, a stretch of a record."""
-        count = min(self.n, BLOCKS) if self.time_series else self.n
+        """(blocks,) first reading of every term of the leave-one-out density: a row, of a record or a long table a stretch."""
+        count = min(self.n, BLOCKS if self.time_series else MOST_TERMS)
         return np.unique(np.linspace(0, self.n, count, endpoint=False).astype(int))
 
     def left_out(self, theta: ValuesBySymbol) -> np.ndarray:
