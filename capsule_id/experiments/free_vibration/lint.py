@@ -15,9 +15,7 @@ from capsule_id.experiments.free_vibration.readings import (
     KINEMATIC_MESSAGES,
     MOST_PERIODS,
     DecayModel,
-    DecaySettings,
     block_size,
-    decay_window,
     default_block_size,
     first_periods,
     lint_kinematics,
@@ -40,8 +38,8 @@ from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.schema import SHORTEST_RECORD, Entry
-from capsule_id.views import Facts, Finding, Message, counted, filled_in
+from capsule_id.rig.schema import SHORTEST_RECORD
+from capsule_id.views import Facts, Finding, Message, filled_in
 
 # lint: Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any
 # record.
@@ -59,8 +57,6 @@ USUAL_K1 = (1500.0, 1000.0)
 PROPOSED_FACTOR = 10
 #: Smallest number of periods; with fewer, one peak determines the damping.
 FEWEST_PERIODS = 2
-#: Fewest block means in a period.
-FEWEST_MEANS = 4
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
@@ -211,25 +207,6 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
         other = " For the part after that, add instead: " + line_of("start").format(start=start) if earlier else ""
         facts = {"file": table.file, "stop": round(stop, digits), "found": stop, "other": other}
         yield Finding("decays.second", "fail", facts, table.label)
-
-
-def check_thin(entry: Entry[DecaySettings]) -> None:
-    """Require block means that leave a record, and that follow its oscillation.
-
-    Raises
-    ------
-    InputError
-        At ``thin``.
-    """
-    thin = entry.table.settings.thin
-    if thin is None or thin == 1:
-        return
-    time, values = decay_window(entry.table)
-    most = min(len(time) // SHORTEST_RECORD, max(block_size(time, values, FEWEST_MEANS), 2))
-    if thin > most:
-        rule = f"thin must leave {SHORTEST_RECORD} means of the record and {FEWEST_MEANS} means in a period"
-        remedy = f"write thin = {most} or less" if most > 1 else "remove thin"
-        raise entry.error("thin", rule, f"{thin} of {counted(len(time), 'sample')}", remedy)
 
 
 def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:

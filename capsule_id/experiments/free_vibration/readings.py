@@ -13,7 +13,7 @@ from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ra
 from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
-from capsule_id.rig.schema import COUNT, Entry, GroundSettings, NameRule, QuantityRule, WordsRule
+from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, QuantityRule, WordsRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE
 from capsule_id.views import Facts, Finding, Message
 
@@ -285,18 +285,6 @@ class DecaySettings(GroundSettings):
     def offers_cubic(self) -> bool:
         """Whether a cubic spring may be fitted where no stiffness is stated: on a slope it is refused."""
         return "slope" not in self.ground
-
-
-def check_ground(entry: Entry[DecaySettings]) -> None:
-    """Refuse a slope that the closed form does not have: of a held capsule it shifts the rest position alone."""
-    settings = entry.table.settings
-    if settings.forward == "capsule":
-        return
-    if settings.stiffness == "cubic":
-        entry.refuse_ground("slope", "a decay with a cubic spring must be on level ground")
-    if settings.capsule == "free":
-        for key in ("slope", "N0"):
-            entry.refuse_ground(key, f'the closed form of a free capsule has no {key}; forward = "capsule" has')
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
 from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import Start
 from capsule_id.experiments.checks import LEVEL, ljung_box, refit
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, equilibrium, viscous_fit
-from capsule_id.experiments.free_vibration.hidden_terms import force_responses
+from capsule_id.experiments.free_vibration.hidden_terms import force_responses, further_columns
 from capsule_id.experiments.free_vibration.models import (
     HalfCycles,
     half_cycles,
@@ -471,16 +470,10 @@ def response_p(record: DecayRecord, theta: Mapping[str, float]) -> float:
     extra = np.column_stack([*columns, relative, relative**2])
     moved = [record.unwhitened({**theta, name: 1.001 * theta[name]}, np)[1] @ parts for name in ("k1", "c")]
     known = np.column_stack([design, *(column - design @ parts for column in moved)])
-    both = np.concatenate([known, extra], axis=1)
-    freedom = record.n - both.shape[1]
-    if freedom < 1:
-        return 1.0
-    own, further = (
-        # A column of zeros is no effect: quadratic damping of a record that stays where it is.
-        float(np.sum((raw - a @ np.linalg.lstsq(a, raw, rcond=None)[0]) ** 2))
-        for a in (x / np.maximum(np.linalg.norm(x, axis=0), np.finfo(float).tiny) for x in (known, both))
-    )
-    return float(stats.f.sf((own - further) / extra.shape[1] * freedom / further, extra.shape[1], freedom))
+    # A column of zeros is no effect: quadratic damping of a record that stays where it is.
+    extra = extra / np.maximum(np.linalg.norm(extra, axis=0), np.finfo(float).tiny)
+    p, _ = further_columns(known, extra, raw)
+    return 1.0 if p is None else p
 
 
 def thinning(record: DecayRecord, per_period: float) -> int:

@@ -13,9 +13,9 @@ from scipy import stats
 
 from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, stated_rate, stretch
 from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.free_vibration.checks import each, halves
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
+from capsule_id.experiments.free_vibration.experiment import each, halves
 from capsule_id.experiments.free_vibration.hidden_terms import (
     check_hidden_terms,
     further_sensitivities,
