@@ -261,7 +261,7 @@ def demanded(tables: "Sequence[TurningPoints]") -> Demanded:
         labels.append(label)
         own = [e.with_model(force.model) for e in own]
     chosen = [e.with_model(e.model, screened(e, e.model)) for e in own] if labels else own
-    return Demanded(labels, chosen, {"labels": [e.label for e in own]})
+    return labels, chosen, {"labels": [e.label for e in own]}
 
 
 def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, FurtherForce] | None:
