@@ -199,8 +199,14 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
     if decay.rest > 0.0 and not earlier:
         before = "slow approach to the first turning point" if decay.pushed else "rest or excitation"
         longer = "" if decay.pushed else ". To keep a longer part, state an earlier start."
-        facts = {"file": table.file, "rest": decay.rest, "start": start, "found": decay.start, "before": before}
-        facts |= {"longer": longer}
+        facts = {
+            "file": table.file,
+            "rest": decay.rest,
+            "start": start,
+            "found": decay.start,
+            "before": before,
+            "longer": longer,
+        }
         yield Finding("decays.release", "warn" if table.settings.start is None else "fail", facts, table.label)
     if stop is not None and not faulty:
         digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
@@ -388,40 +394,27 @@ def _forces(facts: Facts) -> str:
     )
 
 
-def _smaller(facts: Facts) -> str:
-    """How to leave out the large amplitudes of a record."""
-    if facts["start"] is None:
-        return "record again from smaller deflections"
-    line = filled_in(line_of("start"), facts)
-    return f"leave out the larger half of the amplitudes: add {line} to the experiment in rig.toml"
-
-
-def _position(facts: Facts) -> str:
-    seen = (
-        "{label}: the residuals must not depend on the position of the rod, but they do ({p:p}), most from {low:.4g} to "
-        "{high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the sensor, or "
-    )
-    return filled_in(seen, facts) + f"{_smaller(facts)}."
-
-
-def _residuals(facts: Facts) -> str:
-    seen = (
-        "{label}: the residuals must not be larger where the motion is larger, but they are, {ratio:.1f} times ({p:p}). "
-        "What was fitted as noise is an error of the model there, such as a stiffness or a damping that depends on the "
-        "amplitude, or an error of the sensor in proportion to the motion. To find the cause, "
-    )
-    return filled_in(seen, facts) + f"{_smaller(facts)}, and compare the results."
+def _with_smaller(text: str, facts: Facts) -> str:
+    """``text`` with how to leave out the large amplitudes of a record in the place of ``{smaller}``."""
+    smaller = "record again from smaller deflections"
+    if facts["start"] is not None:
+        line = filled_in(line_of("start"), facts)
+        smaller = f"leave out the larger half of the amplitudes: add {line} to the experiment in rig.toml"
+    return filled_in(text, {**facts, "smaller": smaller})
 
 
 def _drift(facts: Facts) -> str:
-    if facts["larger"]:
-        seen = "{label}: the fitted drift of the zero is larger than the motion, so the motion may be part of it. "
-        return filled_in(seen, facts) + "State the start and stop of the free decay."
+    """What the drift of the zero hides: the motion, or an error of the model."""
     seen = (
         "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at its "
-        "frequency. It hides an error of the model. Where dry friction ends the motion, state an earlier stop; else "
+        "frequency. It hides an error of the model. Where dry friction ends the motion, state an earlier stop; else {smaller}."
     )
-    return filled_in(seen, facts) + f"{_smaller(facts)}."
+    if facts["larger"]:
+        seen = (
+            "{label}: the fitted drift of the zero is larger than the motion, so the motion may be part of it. State the "
+            "start and stop of the free decay."
+        )
+    return _with_smaller(seen, facts)
 
 
 def _hidden(facts: Facts) -> str:
@@ -508,12 +501,23 @@ MESSAGES = {
     "decays.position": Message(
         "position of a decay",
         ok="{labels}: the residuals do not depend on position and direction ({p:p})",
-        fail=_position,
+        fail=partial(
+            _with_smaller,
+            "{label}: the residuals must not depend on the position of the rod, but they do ({p:p}), most from {low:.4g} to "
+            "{high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the sensor, or "
+            "{smaller}.",
+        ),
     ),
     "decays.residuals": Message(
         "residuals and amplitude of a decay",
         ok="{labels}: the residuals do not grow with the amplitude ({p:p})",
-        fail=_residuals,
+        fail=partial(
+            _with_smaller,
+            "{label}: the residuals must not be larger where the motion is larger, but they are, {ratio:.1f} times ({p:p}). "
+            "What was fitted as noise is an error of the model there, such as a stiffness or a damping that depends on the "
+            "amplitude, or an error of the sensor in proportion to the motion. To find the cause, {smaller}, and compare the "
+            "results.",
+        ),
     ),
     "decays.drift": Message(
         "drift of a decay",

@@ -320,8 +320,13 @@ class DecayModel:
     def lines(self, *keys: str) -> str:
         """Lines of ``rig.toml`` that state these ``keys`` of the model."""
         words = ", ".join(f'"{word}"' for word in ("viscous", *self.damping))
-        values = {"damping": f"[{words}]", "stiffness": '"cubic"' if self.cubic else '"linear"'}
-        values |= {"drift": f'"{self.drift}"', "noise": f'"{self.noise}"', "thin": str(self.thin)}
+        values = {
+            "damping": f"[{words}]",
+            "stiffness": '"cubic"' if self.cubic else '"linear"',
+            "drift": f'"{self.drift}"',
+            "noise": f'"{self.noise}"',
+            "thin": str(self.thin),
+        }
         return ", ".join(f"{key} = {values[key]}" for key in keys)
 
     @property
@@ -373,18 +378,19 @@ class DecayModel:
     @property
     def additions(self) -> list[str]:
         """Effects of the model that the default lacks, in words."""
-        words = [EFFECTS[symbol] for symbol in self.symbols]
-        return words + (["drift of the zero"] if self.drift != "none" else [])
+        return [*(EFFECTS[symbol] for symbol in self.symbols), *["drift of the zero"] * (self.drift != "none")]
 
     @property
     def name(self) -> str:
         """Words for tables and legends."""
-        words = [" + ".join(("viscous", *self.damping)) + " damping"]
-        words += ["cubic spring"] if self.cubic else []
-        words += [_DRIFTS[self.drift]] if self.drift != "none" else []
-        words += [_NOISES[self.noise]] if self.noise != "white" else []
-        words += [f"means of {self.thin} samples"] if self.thin > 1 else []
-        return ", ".join(words)
+        words = (
+            " + ".join(("viscous", *self.damping)) + " damping",
+            "cubic spring" if self.cubic else "",
+            _DRIFTS.get(self.drift, ""),
+            _NOISES.get(self.noise, ""),
+            f"means of {self.thin} samples" if self.thin > 1 else "",
+        )
+        return ", ".join(filter(None, words))
 
 
 def window_of(table: Table) -> slice:
@@ -403,10 +409,8 @@ def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
 
 def stated_model(table: Table) -> DecayModel:
     """Return the model that the settings of ``table`` state; a long record is thinned where they leave that open."""
-    model = DecayModel.stated(table.settings)
-    if table.settings.thin is not None:
-        return model
-    return replace(model, thin=default_block_size(*decay_window(table)))
+    thin = table.settings.thin or default_block_size(*decay_window(table))
+    return replace(DecayModel.stated(table.settings), thin=thin)
 
 
 def first_periods(table: Table[DecaySettings]) -> Table[DecaySettings]:
