@@ -216,7 +216,7 @@ def find_period(time: Record, x_rel: Record, T: float, floor: float = 0.0) -> Re
     return Repeat(None if reason else best, probabilities, periods, scatter, motion * hidden, motion, noise_sd, reason)
 
 
-def first_true(*rows: tuple[bool, str]) -> str:
+def first_true(*rows: tuple[Any, str]) -> str:
     """The words of the first of ``rows`` that holds; "" where none does."""
     return next((words for holds, words in rows if holds), "")
 

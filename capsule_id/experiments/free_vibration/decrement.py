@@ -111,8 +111,16 @@ class Decrement:
     c: float
 
     @classmethod
-    def of(cls, times: np.ndarray, peaks: np.ndarray, Omega_o: float, delta: float, m1: float) -> "Decrement":
-        """The paper's estimates from frequency and decrement, of a rod of mass ``m1``, kg."""
+    def of(
+        cls, index: np.ndarray, times: np.ndarray, peaks: np.ndarray, m1: float, smallest: float = 0.0
+    ) -> "Decrement":
+        """The paper's estimates from the peaks with these numbers of half periods (p,), of a rod of mass ``m1``, kg.
+
+        The decrement is that of the peaks larger than ``smallest`` times the largest one.
+        """
+        used = np.abs(peaks) > smallest * np.max(np.abs(peaks))
+        Omega_o = float(np.pi / np.polyfit(index, times, 1)[0])
+        delta = float(-2.0 * np.polyfit(index[used], np.log(np.abs(peaks[used])), 1)[0])
         k1 = m1 * Omega_o**2
         return cls(times, peaks, Omega_o, delta, k1, delta / np.pi * float(np.sqrt(k1 * m1)))
 
@@ -188,10 +196,7 @@ def logarithmic_decrement(
     times, peaks = half_cycle_extremes(time, guide, values - rest, lowest)
     if len(times) < 3:
         return None
-    index = np.arange(len(times))
-    Omega_o = float(np.pi / np.polyfit(index, times, 1)[0])
-    delta = float(-2.0 * np.polyfit(index, np.log(np.abs(peaks)), 1)[0])
-    return Decrement.of(times, peaks, Omega_o, delta, m1)
+    return Decrement.of(np.arange(len(times)), times, peaks, m1)
 
 
 class ViscousFit(NamedTuple):

@@ -156,15 +156,20 @@ def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
 
 def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
     """Check that the forces that a second fit has chosen, and no setting states, are far from 0 in the sample."""
-    findings = []
-    found = {symbol: e for e in records if e.replaced for symbol in e.model.symbols}
-    for symbol, e in found.items() if fit.draws else ():
-        values = np.array([draw[symbol] for draw in fit.draws])
-        z = float(abs(np.mean(values)) / np.std(values))
-        if z < FARTHER:
-            facts = {"label": e.label, "name": symbol, "z": z, "effect": EFFECTS[symbol]}
-            findings.append(Finding("decays.found", "warn", facts, e.label, (symbol,)))
-    return findings
+    found = {symbol: e for e in records if e.replaced for symbol in e.model.symbols} if fit.draws else {}
+    draws = {symbol: np.array([draw[symbol] for draw in fit.draws]) for symbol in found}
+    z = {symbol: float(abs(np.mean(values)) / np.std(values)) for symbol, values in draws.items()}
+    return [
+        Finding(
+            "decays.found",
+            "warn",
+            {"label": e.label, "name": symbol, "z": z[symbol], "effect": EFFECTS[symbol]},
+            e.label,
+            (symbol,),
+        )
+        for symbol, e in found.items()
+        if z[symbol] < FARTHER
+    ]
 
 
 def drift(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
@@ -266,10 +271,10 @@ def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | Non
 def _halves(e: DecayRecord) -> list[DecayRecord]:
     """The first and the second half of the part of ``e`` whose peaks exceed its noise; [] for a short one."""
     decrement = e.decrement()
-    if decrement is None or len(decrement.times) < 2 * FEWEST_HALF_CYCLES:
+    # The acceleration jumps where the rod turns, so difference quotients give no standard errors.
+    jumps = e.order == 2 and "dry" in e.model.damping
+    if decrement is None or len(decrement.times) < 2 * FEWEST_HALF_CYCLES or jumps:
         return []
-    if e.order == 2 and "dry" in e.model.damping:
-        return []  # the acceleration jumps where the rod turns, so difference quotients give no standard errors
     time = e.whole[0][e.whole[0] <= decrement.times[-1]]
     if len(time) < 2 * FEWEST_READINGS * e.model.thin:
         return []

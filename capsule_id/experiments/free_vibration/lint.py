@@ -39,7 +39,7 @@ from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
-from capsule_id.views import Facts, Finding, Message, filled_in
+from capsule_id.views import Facts, Finding, Level, Message, filled_in
 
 # lint: Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any
 # record.
@@ -90,7 +90,6 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         faults = faults or [*lint_kinematics(table, used, period)]
     yield from _named(table, release, faults)
     window = time[used], table[channels[0]][used]
-    yield from _thinned(table, *window)
     yield from _sampling(table, *window)
     if not faults:
         yield from _frequency(table, rig, *window)
@@ -192,56 +191,68 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
         yield Finding("decays.sampling", "warn", facts, table.label, ("k1",))
 
 
+#: A finding that may hold: whether it does, its code, level and facts, and its parameters.
+Row = tuple[Any, str, Level, Facts, tuple[str, ...]]
+
+
+def _held(table: Table[Any], rows: Iterable[Row]) -> Iterable[Finding]:
+    """The findings of the ``rows`` that hold."""
+    yield from (Finding(code, level, facts, table.label, own) for holds, code, level, facts, own in rows if holds)
+
+
 def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Finding]:
     """Report rest before the release, and a second excitation; a ``faulty`` record may feign the latter."""
     start, stop = release_time(decay), decay.stop
     earlier = stop is not None and decay.end is None
-    if decay.rest > 0.0 and not earlier:
-        before = "slow approach to the first turning point" if decay.pushed else "rest or excitation"
-        longer = "" if decay.pushed else ". To keep a longer part, state an earlier start."
-        facts = {
-            "file": table.file,
-            "rest": decay.rest,
-            "start": start,
-            "found": decay.start,
-            "before": before,
-            "longer": longer,
-        }
-        yield Finding("decays.release", "warn" if table.settings.start is None else "fail", facts, table.label)
-    if stop is not None and not faulty:
-        digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
-        other = " For the part after that, add instead: " + line_of("start").format(start=start) if earlier else ""
-        facts = {"file": table.file, "stop": round(stop, digits), "found": stop, "other": other}
-        yield Finding("decays.second", "fail", facts, table.label)
-
-
-def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
-    """Report that a long record is fitted by block means, where the settings leave that open."""
-    thin, settings = default_block_size(time, values), table.settings
-    if settings.thin is None and settings.forward == "closed" and thin > 1:
-        wider = "less than 0.5 %" if thin <= block_size(time, values) else "some 3 %"
-        facts = {"file": table.file, "samples": len(time), "thin": thin, "means": len(time) // thin, "wider": wider}
-        yield Finding("decays.thinned", "ok", facts, table.label)
-    cut = first_periods(table).settings.stop
-    if DecayModel.stated(settings).slow and cut != settings.stop:
-        yield Finding("decays.long", "warn", {"file": table.file, "stop": cut, "periods": MOST_PERIODS}, table.label)
+    rest: Facts = {
+        "file": table.file,
+        "rest": decay.rest,
+        "start": start,
+        "found": decay.start,
+        "before": "slow approach to the first turning point" if decay.pushed else "rest or excitation",
+        "longer": "" if decay.pushed else ". To keep a longer part, state an earlier start.",
+    }
+    digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
+    other = " For the part after that, add instead: " + line_of("start").format(start=start) if earlier else ""
+    second: Facts = {"file": table.file, "stop": round(stop or 0.0, digits), "found": stop, "other": other}
+    stated = table.settings.start is not None
+    rows: tuple[Row, ...] = (
+        (decay.rest > 0.0 and not earlier, "decays.release", "fail" if stated else "warn", rest, ()),
+        (stop is not None and not faulty, "decays.second", "fail", second, ()),
+    )
+    yield from _held(table, rows)
 
 
 def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
-    """Report uneven sampling, and too few samples per period or periods."""
+    """Report block means in place of the samples, uneven sampling, and too few samples per period or periods."""
+    settings, thin, cut = table.settings, default_block_size(time, values), first_periods(table).settings.stop
     frequency, (rate, even) = decay_frequency(time, values), sampling(time)
+    periods, per_period = (time[-1] - time[0]) * frequency, rate / frequency
+    uneven = dict[str, Any]()
     try:
         sampling_step(time)
     except InputError as error:
-        yield Finding("decays.uneven", "warn", {"rule": error.rule, "value": error.value}, table.label)
-        if not even:
-            return
-    if rate / frequency < SAMPLES_PER_PERIOD:
-        facts = {"samples": rate / frequency, "wanted": SAMPLES_PER_PERIOD, "other": ""}
-        yield Finding("decays.sampling", "warn", facts, table.label, ("k1",) if even else ())
-    if (time[-1] - time[0]) * frequency < FEWEST_PERIODS:
-        facts = {"periods": (time[-1] - time[0]) * frequency, "wanted": FEWEST_PERIODS}
-        yield Finding("decays.length", "warn", facts, table.label)
+        uneven = {"rule": error.rule, "value": error.value}
+    means: Facts = {
+        "file": table.file,
+        "samples": len(time),
+        "thin": thin,
+        "means": len(time) // thin,
+        "wider": "less than 0.5 %" if thin <= block_size(time, values) else "some 3 %",
+    }
+    by_means = settings.thin is None and settings.forward == "closed" and thin > 1
+    longer = DecayModel.stated(settings).slow and cut != settings.stop
+    few: Facts = {"samples": per_period, "wanted": SAMPLES_PER_PERIOD, "other": ""}
+    short: Facts = {"periods": periods, "wanted": FEWEST_PERIODS}
+    counted = even or not uneven
+    rows: tuple[Row, ...] = (
+        (by_means, "decays.thinned", "ok", means, ()),
+        (longer, "decays.long", "warn", {"file": table.file, "stop": cut, "periods": MOST_PERIODS}, ()),
+        (bool(uneven), "decays.uneven", "warn", uneven, ()),
+        (counted and per_period < SAMPLES_PER_PERIOD, "decays.sampling", "warn", few, ("k1",) if even else ()),
+        (counted and periods < FEWEST_PERIODS, "decays.length", "warn", short, ()),
+    )
+    yield from _held(table, rows)
 
 
 def line_of(key: str) -> str:

@@ -389,12 +389,8 @@ class TurningPoints(Decay):
     def paper_decrement(self, smooth: bool = True) -> Decrement:
         """Observed frequency and logarithmic decrement of the turning points; ``smooth`` has no effect."""
         del smooth
-        index = self.index
         peaks = self.values - (0.5 * (self.values[-1] + self.values[-2]) if self.both_sides else 0.0)
-        used = np.abs(peaks) > 0.05 * np.max(np.abs(peaks))
-        Omega_o = float(np.pi / np.polyfit(index, self.time, 1)[0])
-        delta = float(-2.0 * np.polyfit(index[used], np.log(np.abs(peaks[used])), 1)[0])
-        return Decrement.of(self.time, peaks, Omega_o, delta, self.mass)
+        return Decrement.of(self.index, self.time, peaks, self.mass, smallest=0.05)
 
     def starts(self) -> dict[str, Start]:
         size, c = abs(float(self.rough.peaks[0])), max(self.rough.c, 1e-4 * self.rough.k1 / self.rough.Omega_o)
