@@ -78,10 +78,9 @@ def reading_step(values: np.ndarray) -> float:
         if np.mean(np.abs(gaps / spacing - np.round(gaps / spacing)) < LEVEL_TOLERANCE) > REGULAR_LEVELS:
             return spacing
     first = -int(np.floor(np.log10(scale)))
-    for decimals in range(first, first + MOST_DECIMALS):
-        if np.allclose(np.round(values, decimals), values, rtol=0.0, atol=1e-9 * 10.0**-decimals + 4e-16 * scale):
-            return 10.0**-decimals
-    return 0.0
+    rounded = ((k, np.round(values, k), 1e-9 * 10.0**-k) for k in range(first, first + MOST_DECIMALS))
+    fits = (k for k, own, error in rounded if np.allclose(own, values, rtol=0.0, atol=error + 4e-16 * scale))
+    return next((10.0**-k for k in fits), 0.0)
 
 
 def _largest(values: np.ndarray) -> float:

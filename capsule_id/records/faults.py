@@ -128,12 +128,9 @@ def noisy_stretch(values: np.ndarray, period: float, row: int) -> slice | None:
     squares = (differences[: number * width] ** 2).reshape(number, width)
     noise = np.sqrt(np.mean(squares, axis=1) / math.comb(2 * ORDER, ORDER))
     loud = np.flatnonzero(noise > LOUD * max(float(np.median(noise)), 1e-300))
-    if not len(loud):
-        return None
     for chain in np.split(loud, np.flatnonzero(np.diff(loud) > GAP + 1) + 1):
-        first, last = int(chain[0]), int(chain[-1])
-        if len(chain) >= FEWEST_WINDOWS and first - GAP <= row // width <= last + GAP:
-            return slice(first * width, min((last + 1) * width, len(values)))
+        if len(chain) >= FEWEST_WINDOWS and chain[0] - GAP <= row // width <= chain[-1] + GAP:
+            return slice(int(chain[0]) * width, min((int(chain[-1]) + 1) * width, len(values)))
     return None
 
 
@@ -216,46 +213,26 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
     values : (n,) readings in the unit of the file
     period : of the oscillation, samples; infinite where it is unknown
     """
-    if np.ptp(values) == 0.0:
-        return []
-    few = thinned(values)
+    found = list[Clipped]()
+    few, limits = thinned(values), (float(np.max(values)), float(np.min(values)))
     sides: tuple[tuple[Literal["upper", "lower"], float], ...] = (("upper", 1.0), ("lower", -1.0))
-    limits = float(np.max(values)), float(np.min(values))
-    found = []
-    for (side, sign), limit in zip(sides, limits, strict=True):
+    for (side, sign), limit in zip(sides, limits, strict=True) if limits[0] > limits[1] else ():
         # Readings with so many significant digits have finer steps near zero than at a limit.
         large = few[few / limit >= LARGE_JUMP] if limit else few
         step = reading_step(large if len(large) >= FEWEST_LARGE else few)
         tolerance = max(0.25 * step, 4e-16 * max(abs(limit) for limit in limits))
-        rows = _at_limit(values, (limit, sign), (tolerance, step), period)
-        if len(rows):
-            found.append(Clipped(side, limit, rows))
+        depth = sign * (limit - values)
+        rows = np.flatnonzero(depth <= tolerance)
+        near = np.flatnonzero((depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step))
+        if len(rows) < FEWEST_CLIPPED + EXCESS * (len(near) + _one_sided(near, rows)) / NEIGHBOURS:
+            continue  # a smooth peak has as many
+        runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+        held = runs[0][0] == 0 and len(runs[0]) > LONGEST_HOLD * period
+        # Noise makes single samples equal to the limit by rounding; a clipped peak gives neighbours.
+        runs = [run for run in runs[int(held) :] if len(run) > 1]
+        if sum(map(len, runs)) >= FEWEST_CLIPPED:
+            found.append(Clipped(side, limit, np.concatenate(runs)))
     return found
-
-
-def _at_limit(
-    values: np.ndarray, limit: tuple[float, float], resolution: tuple[float, float], period: float
-) -> np.ndarray:
-    """Indices of the samples at a limit, () where a smooth peak has as many.
-
-    Parameters
-    ----------
-    limit : largest value and 1, or smallest value and -1
-    resolution : distance at which values count as equal, and reading step
-    """
-    (level, sign), (tolerance, step) = limit, resolution
-
-    depth = sign * (level - values)
-    rows = np.flatnonzero(depth <= tolerance)
-    near = np.flatnonzero((depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step))
-    if len(rows) < FEWEST_CLIPPED + EXCESS * (len(near) + _one_sided(near, rows)) / NEIGHBOURS:
-        return rows[:0]
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    if runs[0][0] == 0 and len(runs[0]) > LONGEST_HOLD * period:
-        runs = runs[1:]
-    # Noise makes single samples equal to the limit by rounding; a clipped peak gives neighbours.
-    runs = [run for run in runs if len(run) > 1]
-    return np.concatenate(runs) if sum(map(len, runs)) >= FEWEST_CLIPPED else rows[:0]
 
 
 def _one_sided(near: np.ndarray, rows: np.ndarray) -> int:
@@ -316,14 +293,13 @@ def jump_or_noise(values: np.ndarray, period: float, alone: bool = False) -> Jum
     """
     # Errors of reading in steps are correlated in a slow record, so they do not average out.
     noise = max(noise_level(values), reading_step(values))
-    noisy: list[Jump] = []
-    for share, smallest in SIDES:
-        side = round(share * period)
-        jump = _jump(values, period, side, smallest, noise, alone)
-        if jump is not None and not jump.noisy:
+    found = (_jump(values, period, round(share * period), smallest, noise, alone) for share, smallest in SIDES)
+    jumps = list[Jump]()
+    for jump in filter(None, found):
+        if not jump.noisy:
             return jump
-        noisy += [] if jump is None else [jump]
-    return max(noisy, key=lambda jump: jump.size, default=None)
+        jumps.append(jump)
+    return max(jumps, key=lambda jump: jump.size, default=None)
 
 
 def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: float, alone: bool) -> Jump | None:
@@ -419,8 +395,8 @@ DROPOUT_NOISE, LARGEST_SHARE = 20.0, 0.5
 EXTREME = 50.0
 #: Most samples of one drop-out; fewest equal values of a frozen sensor.
 LONGEST_DROPOUT, FROZEN = 3, 6
-#: Samples from which a record shows its noise level.
-FEWEST_OF_NOISE = 20
+#: Samples from which a record shows its noise level, and a frozen sensor.
+FEWEST_OF_NOISE, FEWEST_OF_FROZEN = 20, 50
 
 
 @dataclass(frozen=True)
@@ -476,34 +452,23 @@ def dropouts(values: np.ndarray) -> np.ndarray:
     low, high = np.quantile(thinned(values), [0.05, 0.95])
     noise = DROPOUT_NOISE * noise_level(values) if len(values) > FEWEST_OF_NOISE else 0.0
     spread = max(high - low, min(noise, LARGEST_SHARE * float(np.ptp(values))))
-    starts, ends = _far_runs(values, spread).T
-    own = values[starts]
-    # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
-    levels, counts = np.unique(own, return_counts=True)
-    repeated = np.isin(own, levels[counts > 1])
-    extreme = np.maximum(low - own, own - high) > EXTREME * spread
-    chosen = repeated | extreme | (own == 0.0)
-    pairs = zip(starts[chosen], ends[chosen], strict=True)
-    return np.concatenate([np.arange(s, e) for s, e in pairs]) if chosen.any() else np.arange(0)
-
-
-def _far_runs(values: np.ndarray, spread: float) -> np.ndarray:
-    """First sample and end, (k, 2), of short runs of one value that stand far off the samples on both sides."""
     starts = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1])
     lengths = np.diff(np.concatenate([starts, [len(values)]]))
     inside = (starts > 0) & (starts + lengths < len(values)) & (lengths <= LONGEST_DROPOUT)
-    starts, lengths = starts[inside], lengths[inside]
-    before, after, own = values[starts - 1], values[starts + lengths], values[starts]
+    starts, ends = starts[inside], (starts + lengths)[inside]
+    before, after, own = values[starts - 1], values[ends], values[starts]
     jump = np.minimum(np.abs(own - before), np.abs(own - after))
-    far = (jump > DROPOUT_RANGE * spread) & (np.abs(after - before) < 0.5 * jump)
+    earlier = np.abs(values[np.maximum(starts - 2, 0)] - before)
+    later = np.abs(values[np.minimum(ends + 1, len(values) - 1)] - after)
+    change = np.maximum(DROPOUT_CHANGES * np.minimum(earlier, later), DROPOUT_STEPS * reading_step(values))
+    far = (jump > DROPOUT_RANGE * spread) & (np.abs(after - before) < 0.5 * jump) & (jump > change)
     far &= np.sign(own - before) == np.sign(own - after)
-    ends = starts + lengths
-    change = [
-        np.abs(values[np.maximum(starts - 2, 0)] - before),
-        np.abs(values[np.minimum(ends + 1, len(values) - 1)] - after),
-    ]
-    far &= jump > np.maximum(DROPOUT_CHANGES * np.minimum(*change), DROPOUT_STEPS * reading_step(values))
-    return np.stack([starts, starts + lengths], axis=1)[far]
+    starts, ends, own = starts[far], ends[far], own[far]
+    # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
+    levels, counts = np.unique(own, return_counts=True)
+    extreme = np.maximum(low - own, own - high) > EXTREME * spread
+    chosen = np.isin(own, levels[counts > 1]) | extreme | (own == 0.0)
+    return np.concatenate([np.arange(0), *map(np.arange, starts[chosen], ends[chosen])])
 
 
 def frozen_samples(values: np.ndarray) -> np.ndarray:
@@ -514,14 +479,10 @@ def frozen_samples(values: np.ndarray) -> np.ndarray:
     repeats = np.concatenate([[False], values[1:] == values[:-1], [False]])
     edges = np.flatnonzero(repeats[1:] != repeats[:-1]) + 1
     starts, ends = edges[::2], edges[1::2]
-    if len(starts) == 0 or len(values) < 50:
-        return np.arange(0)
-    long = ends - starts + 1 >= FROZEN
     inside = (values[starts] < np.max(values)) & (values[starts] > np.min(values)) & (starts > 1) & (ends < len(values))
-    chosen = long & inside
+    chosen = (ends - starts + 1 >= FROZEN) & inside
     # A channel read in coarse steps, or at rest, repeats its values anyway.
     others = np.sum(repeats) - np.sum((ends - starts)[chosen])
-    if others > 0.01 * len(values):
+    if len(values) < FEWEST_OF_FROZEN or others > 0.01 * len(values):
         return np.arange(0)
-    spans = [np.arange(s - 1, e) for s, e in zip(starts[chosen], ends[chosen], strict=True)]
-    return np.concatenate(spans) if spans else np.arange(0)
+    return np.concatenate([np.arange(0), *map(np.arange, starts[chosen] - 1, ends[chosen])])

@@ -9,7 +9,15 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from capsule_id.errors import InputError
-from capsule_id.records.periods import DECIDED, Repeat, find_period, intervals_above, local_polynomials, period_word
+from capsule_id.records.periods import (
+    DECIDED,
+    Repeat,
+    find_period,
+    first_true,
+    intervals_above,
+    local_polynomials,
+    period_word,
+)
 from capsule_id.records.tones import (
     Harmonic,
     fit_harmonic,
@@ -73,13 +81,12 @@ def fit_mean_velocity(time: Record, x_capsule: Record, T: float, period: int | N
     margin = norm.ppf(0.5 + CONFIDENCE / 2.0) * sd * T
     advance = velocity * T
     probability = _probabilities(advance, sd * T, float(np.ptp(x_capsule)))
-    if np.isfinite(margin) and abs(advance) - margin > STANDING_ADVANCE:
-        word = "F" if advance > 0.0 else "B"
-        return MeanVelocity(velocity, sd, word, probability[word])
-    if np.isfinite(margin) and abs(advance) + margin < STANDING_ADVANCE:
-        return MeanVelocity(velocity, sd, "S", probability["S"])
+    # A margin that is no number decides nothing.
+    moves, stands = abs(advance) - margin > STANDING_ADVANCE, abs(advance) + margin < STANDING_ADVANCE
+    word = ("F" if advance > 0.0 else "B") if moves else "S" if stands else None
     reason = f"direction: advance {1e6 * advance:.3g} ± {1e6 * sd * T:.2g} um per period, standing is below 0.1 um"
-    return MeanVelocity(velocity, sd, None, max(probability.values()), reason)
+    likeliest = max(probability.values()) if word is None else probability[word]
+    return MeanVelocity(velocity, sd, word, likeliest, "" if word else reason)
 
 
 def _probabilities(advance: float, sd: float, largest: float) -> dict[str, float]:
@@ -268,12 +275,14 @@ def find_contacts(cycle: Cycle) -> Contacts:
     single = np.convolve(single, np.full(_AVERAGED_SAMPLES, _AVERAGED_SAMPLES**-0.5), mode="same")
     agreeing, cycles = _agreeing_cycles(cycle, single, levels, stretches)
     counts = set(spikes + crossings)
-    reason = ""
-    if len(counts) > 1:
-        words = ["/".join(map(str, one)) or "not recorded" for one in (spikes, crossings)]
-        reason = f"contacts: spikes {words[0]}, crossings of the gap {words[1]}"
-    elif 2 * agreeing <= cycles:
-        reason = f"contacts: {agreeing} of {cycles} single periods show the {counts.pop()} of all together"
+    words = ["/".join(map(str, one)) or "not recorded" for one in (spikes, crossings)]
+    reason = first_true(
+        (len(counts) > 1, f"contacts: spikes {words[0]}, crossings of the gap {words[1]}"),
+        (
+            2 * agreeing <= cycles,
+            f"contacts: {agreeing} of {cycles} single periods show the {crossings[0]} of all together",
+        ),
+    )
     count = None if reason else counts.pop()
     shortest = min((length for _, length in stretches), default=0) * cycle.period / len(z)
     return Contacts(count, spikes, crossings, seen, shortest or None, agreeing, cycles, reason)
@@ -302,7 +311,7 @@ def _shortfall(cycle: Cycle) -> _Shortfall | None:
         cycle.x_rel,
         cycle.period,
         cycle.phase,
-        max(_NARROW_HALF_WIDTH * cycle.step, _WIDE_HALF_WIDTH * _excitation_period(cycle)),
+        max(_NARROW_HALF_WIDTH * cycle.step, _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega),
         3,
     )
     clear = _clear_of_gap(cycle, wide.value)
@@ -324,10 +333,6 @@ def _shortfall(cycle: Cycle) -> _Shortfall | None:
     return _Shortfall(shortfall, sd, np.hypot(of_law, of_terms))
 
 
-def _excitation_period(cycle: Cycle) -> float:
-    return 2.0 * np.pi / cycle.Omega
-
-
 def _linear_law_terms(cycle: Cycle, x_rel: np.ndarray, rate: np.ndarray) -> np.ndarray:
     angle = cycle.Omega * cycle.time
     return np.stack([np.ones_like(angle), x_rel, rate, np.cos(angle), np.sin(angle)], axis=1)
@@ -342,7 +347,7 @@ def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
     other = np.concatenate([other - cycle.period, other, other + cycle.period])
     after = np.searchsorted(other, cycle.phase).clip(1, len(other) - 1)
     distance = np.minimum(cycle.phase - other[after - 1], other[after] - cycle.phase)
-    return below & (distance > _WIDE_HALF_WIDTH * _excitation_period(cycle))
+    return below & (distance > _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega)
 
 
 def _impact_line(cycle: Cycle, push: _Shortfall | None) -> ImpactLine | None:
@@ -477,15 +482,11 @@ def _label(
     if repeat.period is None:
         return UNDECIDED, repeat.probability, (repeat.reason,)
     period = period_word(repeat.period)
-    if repeat.period == 0:
-        return period, repeat.probability, ()
-    reasons = [part.reason for part in (velocity, contacts) if part is not None and part.reason]
-    if velocity is None:
-        reasons.append("x_capsule was not recorded")
-    if contacts is None:
-        reasons.append("spring and gap are not stated")
-    if reasons or velocity is None or contacts is None or contacts.count is None:
-        return period, repeat.probability, tuple(reasons)
+    missing = {"x_capsule was not recorded": velocity, "spring and gap are not stated": contacts}
+    reasons = [part.reason for part in missing.values() if part is not None and part.reason]
+    reasons += [words for words, part in missing.items() if part is None]
+    if velocity is None or contacts is None or contacts.count is None or reasons or repeat.period == 0:
+        return period, repeat.probability, tuple(reasons) if repeat.period else ()
     whole = f"{period}-{velocity.direction}-{Fraction(contacts.count, repeat.period)}"
     probability = repeat.probability * velocity.probability * contacts.probability
     if probability < DECIDED:

@@ -8,9 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from capsule_id.records.tones import (
-    noise_level,
-)
+from capsule_id.records.tones import noise_level
 from capsule_id.rig.filters import Record
 
 # fold: Folds a periodic record onto one period; the samples of each period lie between those of the others.
@@ -174,35 +172,53 @@ def find_period(time: Record, x_rel: Record, T: float, floor: float = 0.0) -> Re
     periods = float(len(time) * step / T)
     noise_sd = max(noise_level(x_rel, _DIFFERENCE_ORDER), floor)
     motion = float(np.sqrt(max(np.var(x_rel) - noise_sd**2, 0.0)))
-    reason = ""
-    if periods < FEWEST_PERIODS:
-        reason = f"the record holds {periods:.1f} periods of the drive, {FEWEST_PERIODS} are needed"
-    elif T / step < FEWEST_SAMPLES:
-        reason = f"the record holds {T / step:.1f} samples per period of the drive, {FEWEST_SAMPLES} are needed"
-    elif motion <= noise_sd:
-        reason = f"noise: its standard deviation is {1e6 * noise_sd:.3g} um, the motion {1e6 * motion:.3g} um"
+    reason = first_true(
+        (
+            periods < FEWEST_PERIODS,
+            f"the record holds {periods:.1f} periods of the drive, {FEWEST_PERIODS} are needed",
+        ),
+        (
+            T / step < FEWEST_SAMPLES,
+            f"the record holds {T / step:.1f} samples per period of the drive, {FEWEST_SAMPLES} are needed",
+        ),
+        (
+            motion <= noise_sd,
+            f"noise: its standard deviation is {1e6 * noise_sd:.3g} um, the motion {1e6 * motion:.3g} um",
+        ),
+    )
     if reason:
-        nan = float("nan")
-        return Repeat(None, np.zeros(LONGEST_PERIOD + 1), periods, nan, nan, motion, noise_sd, reason)
+        none = np.zeros(LONGEST_PERIOD + 1)
+        return Repeat(None, none, periods, float("nan"), float("nan"), motion, noise_sd, reason)
     cycles, gain = _polynomials(time - time[0], x_rel / motion, T)
     evidence = _Evidence(cycles, gain * (noise_sd / motion) ** 2)
     probabilities = evidence.probabilities()
     best = int(np.argmax(probabilities))
     hidden = evidence.hidden(max(best, 1))
-    if probabilities[best] < DECIDED:
-        order = np.argsort(-probabilities)[:2]
-        words = ", ".join(f"{period_word(int(i))} {probabilities[i]:.2f}" for i in order)
-        reason = f"period: probabilities {words}; record more than {periods:.0f} periods of the drive"
-    elif best and hidden > LARGEST_HIDDEN:
-        part = f"{hidden:.1%} of the motion"
-        reason = f"noise and scatter: they hide a part of another period below {part}; record more periods"
-    elif 2 * best > periods:
-        reason = f"repeats after {best} periods of the drive, but holds only {periods:.1f}"
-    elif best == 0 and periods < FEWEST_APERIODIC:
-        needed = f"{FEWEST_APERIODIC} periods of the drive are needed"
-        reason = f"no repeat; the record of {periods:.1f} periods is too short for longer ones, {needed}"
+    likeliest = np.argsort(-probabilities)[:2].tolist()
+    words = ", ".join(f"{period_word(i)} {probabilities[i]:.2f}" for i in likeliest)
+    reason = first_true(
+        (
+            probabilities[best] < DECIDED,
+            f"period: probabilities {words}; record more than {periods:.0f} periods of the drive",
+        ),
+        (
+            best > 0 and hidden > LARGEST_HIDDEN,
+            f"noise and scatter: they hide a part of another period below {hidden:.1%} of the motion; record more periods",
+        ),
+        (2 * best > periods, f"repeats after {best} periods of the drive, but holds only {periods:.1f}"),
+        (
+            best == 0 and periods < FEWEST_APERIODIC,
+            f"no repeat; the record of {periods:.1f} periods is too short for longer ones, {FEWEST_APERIODIC} periods of the "
+            "drive are needed",
+        ),
+    )
     scatter = motion * evidence.scatter(max(best, 1))
     return Repeat(None if reason else best, probabilities, periods, scatter, motion * hidden, motion, noise_sd, reason)
+
+
+def first_true(*rows: tuple[Any, str]) -> str:
+    """The words of the first of ``rows`` that holds; "" where none does."""
+    return next((words for holds, words in rows if holds), "")
 
 
 def period_word(period: int) -> str:
@@ -276,9 +292,7 @@ class _Evidence:
                 self._log_evidence(levels[0], np.geomspace(*PART, _GRID)) + np.log(np.sum(prior[self._longest :]))
             )
         posterior = np.exp(np.array(parts) - _log_sum(np.array(parts)))
-        found = np.zeros(LONGEST_PERIOD + 1)
-        found[: self._longest + 1] = posterior[: self._longest + 1]
-        return found
+        return np.pad(posterior[: self._longest + 1], (0, LONGEST_PERIOD - self._longest))
 
     def _log_evidence(
         self, levels: list[_Level], q: Float[np.ndarray, " q"], weight: Float[np.ndarray, " q"] | float = 1.0 / _GRID
@@ -309,9 +323,8 @@ class _Evidence:
         last, before = self._cycles[1:], self._cycles[:-1]
         basis, divisors = self._basis(len(last), n)
         r = CORRELATIONS[:, None]
-        rows, r_rows = (basis.T @ y for y in (last, before)), r[:, :, None]
-        one, other = rows
-        power = np.sum((one - r_rows * other) ** 2, axis=2)
+        one, other = (basis.T @ y for y in (last, before))
+        power = np.sum((one - r[:, :, None] * other) ** 2, axis=2)
         total = np.array([np.sum((last - x * before) ** 2) for x in CORRELATIONS.tolist()])
         levels, first = [], self._drift_terms
         rest = _Level(total - np.sum(power, axis=1), np.ones_like(CORRELATIONS), len(last) - basis.shape[1])

@@ -27,9 +27,8 @@ def stated_Omega(table: Table) -> float:
         If no frequency is stated and the record is sampled unevenly.
     """
     settings = table.settings
-    if settings.Omega is None and settings.f is None:
-        return 2.0 * np.pi * dominant_frequency(table["time"], table["x_base"])
-    return settings.angular_frequency
+    unstated = settings.Omega is None and settings.f is None
+    return 2.0 * np.pi * dominant_frequency(table["time"], table["x_base"]) if unstated else settings.angular_frequency
 
 
 def stated_gap(table: Table) -> Quantity:
@@ -163,13 +162,10 @@ def fit_harmonic(time: Record, values: Record, Omega: float) -> Harmonic:
         strongest = 2.0 * np.pi * dominant_frequency(time, values)
         near = abs(strongest - Omega) < _search_half_width(time)
         guesses = [strongest] if near else [Omega, strongest]
-    found, left = _refine(time, values, guesses[0])
-    for guess in guesses[1:]:
-        other, less = _refine(time, values, guess)
-        # In a coarse record the stated frequency and its alias fit equally well: prefer the stated one.
-        if left - less > _significant_reduction(len(time)) * less:
-            found, left = other, less
-    return _harmonic_at(time, values, found, Omega)
+    (found, left), (other, less) = (_refine(time, values, guess) for guess in (guesses[0], guesses[-1]))
+    # In a coarse record the stated frequency and its alias fit equally well: prefer the stated one.
+    better = left - less > _significant_reduction(len(time)) * less
+    return _harmonic_at(time, values, other if better else found, Omega)
 
 
 def other_tone(time: Record, values: Record) -> float | None:
@@ -206,26 +202,15 @@ def tone_at(time: Record, values: Record, Omega: float) -> tuple[float, float, f
     -------
     amplitude and offset in the unit of ``values``, phase in rad, in (-pi, pi]
     """
-    cosine, sine, offset = np.linalg.lstsq(_tone_design(time, Omega), values)[0]
+    design = np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones_like(time)], axis=1)
+    cosine, sine, offset = np.linalg.lstsq(design, values)[0]
     return float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine)), float(offset)
-
-
-def _tone_design(time: Record, Omega: float) -> np.ndarray:
-    return np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones_like(time)], axis=1)
 
 
 def _residuals(time: Record, values: Record, Omega: float) -> np.ndarray:
     """Residuals (n,) of the best tone of this frequency."""
-    design = _tone_design(time, Omega)
-    try:
-        unknowns = np.linalg.solve(design.T @ design, design.T @ values)
-    except np.linalg.LinAlgError:  # much less than a period: the cosine is constant
-        unknowns = np.linalg.lstsq(design, values)[0]
-    return values - design @ unknowns
-
-
-def _sum_of_squares(time: Record, values: Record, Omega: float) -> float:
-    return float(np.sum(_residuals(time, values, Omega) ** 2))
+    amplitude, phase, offset = tone_at(time, values, Omega)
+    return values - amplitude * np.cos(Omega * time + phase) - offset
 
 
 def _significant_reduction(samples: int) -> float:
@@ -243,7 +228,7 @@ def _refine(time: Record, values: Record, guess: float) -> tuple[float, float]:
     """(Omega, sum of squares) of the lowest minimum near ``guess``."""
     width = _search_half_width(time)
     grid = np.linspace(max(guess - width, 0.05 * guess), guess + width, _SEARCH_POINTS)
-    best = int(np.argmin([_sum_of_squares(time, values, Omega) for Omega in grid]))
+    best = int(np.argmin([np.sum(_residuals(time, values, Omega) ** 2) for Omega in grid]))
     step = grid[1] - grid[0]
     bounds = (max(grid[best] - step, 0.5 * grid[0]), grid[best] + step)
     unit = float(np.std(values)) or 1.0
@@ -255,7 +240,7 @@ def _refine(time: Record, values: Record, guess: float) -> tuple[float, float]:
         ftol=TOLERANCE,
         xtol=TOLERANCE,
     ).x[0]
-    return float(found), _sum_of_squares(time, values, found)
+    return float(found), float(np.sum(_residuals(time, values, found) ** 2))
 
 
 def _harmonic_at(time: Record, values: Record, Omega: float, stated: float) -> Harmonic:
@@ -265,11 +250,10 @@ def _harmonic_at(time: Record, values: Record, Omega: float, stated: float) -> H
     slope = -amplitude * np.sin(angle)
     jacobian = np.stack([np.cos(angle), slope, slope * time, np.ones_like(time)], axis=1)
     scale = np.linalg.norm(jacobian, axis=0)
-    left = float(np.sum((values - amplitude * np.cos(angle) - offset) ** 2))
+    left, of_stated = (float(np.sum(_residuals(time, values, one) ** 2)) for one in (Omega, stated))
     noise_sd = float(np.sqrt(left / (len(time) - 4)))
-    refuted = _sum_of_squares(time, values, stated) - left > _significant_reduction(len(time)) * left
-    errors = noise_sd * np.sqrt(_variances(jacobian / scale)) / scale
-    sd = [float(error) for error in errors]
+    refuted = of_stated - left > _significant_reduction(len(time)) * left
+    sd = (noise_sd * np.sqrt(_variances(jacobian / scale)) / scale).tolist()
     return Harmonic(Omega, sd[2], amplitude, sd[0], phase, sd[1], offset, noise_sd, stated, refuted)
 
 
@@ -356,60 +340,45 @@ def estimate_clock(time: Record, values: Record, other_time: OtherRecord, other_
             swapped.drift_sd * factor**2,
             swapped.explained,
         )
-    reference = _Reference.of(time, values)
-    centre = float(np.mean(other_time))
+    reference, centre = _reference(time, values), float(np.mean(other_time))
     # The offset at the centre of the other record is nearly independent of the drift.
     few = max(1, len(other_time) // _SAMPLES_OF_A_TRIAL)
-    starts = _offsets(reference.spline.x, reference.spline(reference.spline.x), other_time, other_values)
-    trials = [_least_squares(reference, other_time[::few], other_values[::few], first) for first in starts]
+    starts = _offsets(reference[0].x, reference[0](reference[0].x), other_time, other_values)
+    trials = (_least_squares(reference, other_time[::few], other_values[::few], first) for first in starts)
     tried = [fit for fit in trials if fit is not None]
-    best = max((fit.explained for fit in tried), default=0.0)
-    chosen = next((fit for fit in tried if 1.0 - fit.explained <= AS_GOOD * (1.0 - best)), None)
-    fit = None if chosen is None else _least_squares(reference, other_time, other_values, chosen.shift, chosen.drift)
-    if fit is None or fit.explained < LEAST_EXPLAINED:
+    best = max((explained for explained, *_ in tried), default=0.0)
+    chosen = next((fit for fit in tried if 1.0 - fit[0] <= AS_GOOD * (1.0 - best)), None)
+    fit = None if chosen is None else _least_squares(reference, other_time, other_values, *chosen[1:3])
+    if fit is None or fit[0] < LEAST_EXPLAINED:
         rule = f"two loggers must record the same signal for {FEWEST_COMMON} samples; it explains {LEAST_EXPLAINED:.0%} or more"
         raise InputError(rule, f"{best:.0%}", "name a signal that both files hold, such as a trigger")
+    explained, shift, drift, covariance = fit
     to_origin = np.array([1.0, -centre])
-    return Clock(
-        fit.shift - centre * fit.drift,
-        fit.drift,
-        float(np.sqrt(to_origin @ fit.covariance @ to_origin)),
-        float(np.sqrt(fit.covariance[1, 1])),
-        fit.explained,
-    )
+    sd = float(np.sqrt(to_origin @ covariance @ to_origin)), float(np.sqrt(covariance[1, 1]))
+    return Clock(shift - centre * drift, drift, *sd, explained)
 
 
-@dataclass(frozen=True)
-class _Reference:
+def _reference(time: np.ndarray, values: np.ndarray) -> tuple[CubicSpline, float, float]:
     """The common signal by the denser logger, without the components of its spectrum that noise alone explains.
 
     The slope of a noisy spline would otherwise look like information on the clock.
 
-    Attributes
-    ----------
-    noise : sd of the noise of a sample
-    slope_noise : sd of the noise that is left in the slope of the spline, per s
+    Returns
+    -------
+    spline, sd of the noise of a sample, and sd of the noise that is left in the slope of the spline, per s
     """
-
-    spline: CubicSpline
-    noise: float
-    slope_noise: float
-
-    @classmethod
-    def of(cls, time: np.ndarray, values: np.ndarray) -> "_Reference":
-        even = np.linspace(time[0], time[-1], len(time))
-        on_grid = np.interp(even, time, values) if np.ptp(np.diff(time)) > 1e-6 * np.median(np.diff(time)) else values
-        line = np.linspace(on_grid[0], on_grid[-1], len(even))
-        spectrum = np.fft.rfft(on_grid - line)
-        power = np.abs(spectrum) ** 2
-        floor = float(np.median(power[3 * len(power) // 4 :])) / np.log(2.0)
-        kept = power >= ABOVE_NOISE * floor
-        spectrum[~kept] = 0.0
-        rates = 2.0 * np.pi * np.fft.rfftfreq(len(even), even[1] - even[0])
-        # Noise alone keeps a component only where its power reaches the threshold.
-        slope_noise = np.sqrt(2.0 * ABOVE_NOISE * floor * np.sum(rates[kept] ** 2)) / len(even)
-        spline = CubicSpline(even, np.fft.irfft(spectrum, len(even)) + line)
-        return cls(spline, float(np.sqrt(floor / len(even))), float(slope_noise))
+    even = np.linspace(time[0], time[-1], len(time))
+    on_grid = np.interp(even, time, values) if np.ptp(np.diff(time)) > 1e-6 * np.median(np.diff(time)) else values
+    line = np.linspace(on_grid[0], on_grid[-1], len(even))
+    spectrum = np.fft.rfft(on_grid - line)
+    power = np.abs(spectrum) ** 2
+    floor = float(np.median(power[3 * len(power) // 4 :])) / np.log(2.0)
+    kept = power >= ABOVE_NOISE * floor
+    rates = 2.0 * np.pi * np.fft.rfftfreq(len(even), even[1] - even[0])
+    # Noise alone keeps a component only where its power reaches the threshold.
+    slope_noise = np.sqrt(2.0 * ABOVE_NOISE * floor * np.sum(rates[kept] ** 2)) / len(even)
+    spline = CubicSpline(even, np.fft.irfft(np.where(kept, spectrum, 0.0), len(even)) + line)
+    return spline, float(np.sqrt(floor / len(even))), float(slope_noise)
 
 
 def _offsets(time: np.ndarray, values: np.ndarray, other_time: np.ndarray, other_values: np.ndarray) -> list[float]:
@@ -427,25 +396,23 @@ def _offsets(time: np.ndarray, values: np.ndarray, other_time: np.ndarray, other
     return nearest or [float(time[0] - other_time[0])]
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Offset at the centre of the other record, s, drift, their covariance, and the share of the variance explained."""
-
-    shift: float
-    drift: float
-    covariance: np.ndarray
-    explained: float
-
-
 def _least_squares(
-    reference: _Reference, times: np.ndarray, values: np.ndarray, shift: float, drift: float = 0.0
-) -> _Fit | None:
+    reference: tuple[CubicSpline, float, float],
+    times: np.ndarray,
+    values: np.ndarray,
+    shift: float,
+    drift: float = 0.0,
+) -> tuple[float, float, float, np.ndarray] | None:
     """The fit that begins at an offset and a drift; None where the records do not overlap.
 
     Samples count where the slope of the signal exceeds its noise: the others know nothing of the clock.
+
+    Returns
+    -------
+    share of the variance explained, offset at the centre of the other record, s, drift, and their covariance (2, 2)
     """
-    spline, slope = reference.spline, reference.spline.derivative()
-    centre = float(np.mean(times))
+    spline, noise, slope_noise = reference
+    centre, slope = float(np.mean(times)), spline.derivative()
     density = (len(times) - 1) / np.ptp(times) * (spline.x[1] - spline.x[0])
     covariance, explained = np.eye(2), 0.0
     for _ in range(_STEPS):
@@ -456,18 +423,18 @@ def _least_squares(
         signal, own, rate = spline(mapped[inside]), values[inside], slope(mapped[inside])
         base = np.column_stack([signal, np.ones(len(own))])
         (gain, constant), *_ = np.linalg.lstsq(base, own, rcond=None)
-        rate = np.where(np.abs(rate) > STEEP * reference.slope_noise, gain * rate, 0.0)
+        rate = np.where(np.abs(rate) > STEEP * slope_noise, gain * rate, 0.0)
         design = np.column_stack([rate, rate * (times[inside] - centre), base])
         residual = own - gain * signal - constant
         step, *_ = np.linalg.lstsq(design, residual, rcond=None)
         # The noise of the reference counts as much as that of the other record, by its own number of samples.
-        shared = np.linalg.pinv(design.T @ design) * (gain * reference.noise) ** 2 * density
+        shared = np.linalg.pinv(design.T @ design) * (gain * noise) ** 2 * density
         covariance = (_newey_west(design, residual) + shared)[:2, :2]
         explained = 1.0 - float(np.var(residual) / max(np.var(own), 1e-300))
         shift, drift = shift + float(step[0]), drift + float(step[1])
         if np.all(np.abs(step[:2]) <= _CONVERGED * np.sqrt(np.diag(covariance))):
             break
-    return _Fit(shift, drift, covariance, explained)
+    return explained, shift, drift, covariance
 
 
 def _newey_west(design: np.ndarray, residual: np.ndarray) -> np.ndarray:

@@ -172,17 +172,14 @@ def label_text(motion: MeasuredMotion) -> str:
 
 def _evidence(motion: MeasuredMotion) -> Iterator[str]:
     evidence: Evidence = motion.evidence
-    if evidence.repeat:
-        repeat = evidence.repeat
+    if repeat := evidence.repeat:
         yield f"{repeat.periods:.1f} periods of the drive, noise of x_rel {1e6 * repeat.noise_sd:.3g} um"
         if repeat.period:
             yield f"scatter from cycle to cycle {repeat.scatter / repeat.motion:.2%} of the motion"
     if evidence.mean_velocity:
         yield f"{1e3 * motion.mean_velocity:.4g} ± {1e3 * evidence.mean_velocity.velocity_sd:.2g} mm/s"
-    if evidence.contacts:
-        contacts = evidence.contacts
-        spikes = "/".join(map(str, contacts.spikes)) or "not recorded"
-        crossings = "/".join(map(str, contacts.crossings))
+    if contacts := evidence.contacts:
+        spikes, crossings = ("/".join(map(str, one)) or "not recorded" for one in (contacts.spikes, contacts.crossings))
         yield (
             f"contacts by spikes {spikes}, by crossings {crossings}, "
             f"same count in {contacts.agreeing} of {contacts.cycles} single periods"

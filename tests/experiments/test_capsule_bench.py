@@ -13,8 +13,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.capsule_experiment import CapsuleDecay, CapsuleForward, CapsulePushes
 from capsule_id.experiments.dynamic_friction import DynamicFriction
-from capsule_id.experiments.free_vibration.checks import check_free_decay
-from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_free_decay
 from capsule_id.experiments.friction import unit_law
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.point_stage import PointStage, fit_points

@@ -12,8 +12,13 @@ from scipy.integrate import solve_ivp
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks import refit
-from capsule_id.experiments.free_vibration.checks import check_drift, check_halves, check_positions, fast_rms
-from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.experiment import (
+    FreeVibration,
+    check_drift,
+    check_halves,
+    check_positions,
+    fast_rms,
+)
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.experiments.free_vibration.readings import CHANNELS, DecayModel

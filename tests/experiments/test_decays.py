@@ -1,6 +1,7 @@
 """Decays and their moments: against direct sums and against SciPy's DOP853 with located turning points."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -71,10 +72,11 @@ def test_viscous_decay_of_any_damping(ratio: float) -> None:
             [integrate(lambda t, s: [s[1], -(k1 * s[0] + c * s[1]) / M1], state, TIME) for state in states], axis=1
         )
 
-    found = jit_quickly(viscous_basis)(jnp.asarray(TIME), K1, c, M1)
+    basis = partial(viscous_basis, xp=jnp)
+    found = jit_quickly(basis)(jnp.asarray(TIME), K1, c, M1)
     np.testing.assert_allclose(found, scipy(K1, c), rtol=0, atol=1e-9)
     np.testing.assert_allclose(found, viscous_basis(TIME, K1, c, M1, np), rtol=0, atol=1e-14)
-    slopes = jax.jacfwd(viscous_basis, (1, 2))(jnp.asarray(TIME), K1, c, M1)
+    slopes = jax.jacfwd(basis, (1, 2))(jnp.asarray(TIME), K1, c, M1)
     for slope, (up, down), step in zip(
         slopes, (((1.001 * K1, c), (0.999 * K1, c)), ((K1, 1.001 * c), (K1, 0.999 * c))), (K1, c), strict=True
     ):

@@ -1,6 +1,6 @@
 """Free vibration: columns, settings, rules, template, lint, the paper's estimates and the twin."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,18 +10,18 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import (
     STRONGEST,
-    exponential_fit,
     likelihood_gain,
     swings_enough,
+    viscous_basis,
     viscous_fit,
 )
-from capsule_id.experiments.free_vibration.lint import MESSAGES, check_thin, lint_decay
+from capsule_id.experiments.free_vibration.lint import MESSAGES, lint_decay
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
     DecayModel,
     DecaySettings,
+    block_size,
     channel_of,
-    check_ground,
     cut_at_release,
     decay_window,
     first_periods,
@@ -60,8 +60,6 @@ def decay(
     rate: float = 2000.0,
 ) -> dict[str, np.ndarray]:
     """Simulate a decay from rest at ``release`` m at time 0; the noise sd is ``relative_sd`` of the release."""
-    from capsule_id.experiments.free_vibration.decrement import viscous_basis
-
     time = np.arange(round(duration * rate)) / rate
     x = release * viscous_basis(time, k1, c, m1, np)[:, 0]
     return {"time [s]": time, "x_rel [mm]": 1e3 * (x + relative_sd * release * rng.standard_normal(time.size))}
@@ -87,70 +85,96 @@ DRIFT_TIME = Parameter("drift_time", "s", "correlation time of a record's drift"
 TURNING_TIME = nuisance("turning_time", "s", "time of the first turning point of a decay", "t_0")
 
 
-def _check_window(entry: Entry[DecaySettings]) -> None:
-    """Require start < stop, both inside the record to one sampling step, and enough samples between them."""
+def _faults(entry: Entry[DecaySettings]) -> Iterator[tuple[Any, ...]]:
+    """Rows of what settings and channels must not state: whether they do, and the arguments of ``Entry.error``.
+
+    A row is made when those before it hold no fault.
+    """
+    table, settings, model = entry.table, entry.table.settings, DecayModel.stated(entry.table.settings)
+    names = " ".join(sorted(set(CHANNELS).intersection(table.columns)))
+    capsule, points = settings.forward == "capsule", settings.samples == "turning_points"
+    yield from (
+        (stated and names != "x_rel", key, f"{key} = {words} needs x_rel and no other channel", names, "map x_rel only")
+        for key, stated, words in (("samples", points, '"turning_points"'), ("forward", capsule, '"capsule"'))
+    )
     entry.check_length()
-    time, settings = entry.table["time"], entry.table.settings
+    time = table["time"]
     step = median_step(time)  # the stated duration of n samples is often n steps, one more than the record has
-    edges = {"start": float(time[0]), "stop": float(time[-1])}
-    for key, value in (("start", settings.start), ("stop", settings.stop)):
-        if value is None:
-            continue
-        if not time[0] - step <= value <= time[-1] + step:
-            span = f"a time from {time[0]:g} to {time[-1]:g} s"
-            raise entry.error(key, f"{key} must lie inside the record", f"{value:g} s", f"write {span}")
-        edges[key] = value
-    place = "start" if settings.stop is None else "stop"
-    if edges["start"] >= edges["stop"]:
-        value = f"{edges['start']:g} s and {edges['stop']:g} s"
-        raise entry.error(place, "start must be before stop", value, "correct one of them")
-    inside = len(decay_window(entry.table)[0])
-    if inside < SHORTEST_RECORD:
-        rule = f"at least {SHORTEST_RECORD} samples must lie between start and stop"
-        raise entry.error(place, rule, counted(inside, "sample"), "widen the window")
+    stated = {key: value for key in ("start", "stop") if (value := getattr(settings, key)) is not None}
+    span = f"write a time from {time[0]:g} to {time[-1]:g} s"
+    yield from (
+        (not time[0] - step <= value <= time[-1] + step, key, f"{key} must lie inside the record", f"{value:g} s", span)
+        for key, value in stated.items()
+    )
+    start, stop = ({"start": time[0], "stop": time[-1]} | stated).values()
+    place, inside = "start" if settings.stop is None else "stop", len(decay_window(table)[0])
+    rule = f"at least {SHORTEST_RECORD} samples must lie between start and stop"
+    yield from (
+        (start >= stop, place, "start must be before stop", f"{start:g} s and {stop:g} s", "correct one of them"),
+        (inside < SHORTEST_RECORD, place, rule, counted(inside, "sample"), "widen the window"),
+        (
+            capsule and settings.capsule == "held",
+            "forward",
+            "forward capsule needs a capsule that is free to move",
+            "held",
+            'add capsule = "free", or write forward = "closed" where the capsule was held',
+        ),
+        (
+            capsule and (model != DecayModel() or points),
+            "forward",
+            "forward capsule has viscous damping, a linear spring and white noise only",
+            model.name,
+            'write forward = "closed", or remove damping, stiffness, drift and noise',
+        ),
+        *(
+            (
+                points and getattr(settings, key) not in (None, default),
+                key,
+                "turning points have white noise and no drift, and each of them counts",
+                str(getattr(settings, key)),
+                f"remove {key}, or samples",
+                True,
+            )
+            for key, default in (("drift", "none"), ("noise", "white"), ("thin", 1))
+        ),
+    )
+    thin = settings.thin or 1
+    if thin > 1:
+        size = block_size(*decay_window(table), FEWEST_MEANS)
+        most = min(inside // SHORTEST_RECORD, max(size, 2))
+        rule = f"thin must leave {SHORTEST_RECORD} means of the record and {FEWEST_MEANS} means in a period"
+        remedy = f"write thin = {most} or less" if most > 1 else "remove thin"
+        yield thin > most, "thin", rule, f"{thin} of {counted(inside, 'sample')}", remedy
 
 
-def _check_forward(entry: Entry[DecaySettings]) -> None:
-    """Require a free capsule and the default model of the decay for the capsule model."""
+def _check_settings(entry: Entry[DecaySettings]) -> None:
+    """Refuse a slope that the closed form does not have, and the first of ``_faults``.
+
+    A slope of a held capsule shifts the rest position alone.
+    """
     settings = entry.table.settings
-    if settings.forward != "capsule":
-        return
-    if settings.capsule == "held":
-        remedy = 'add capsule = "free", or write forward = "closed" where the capsule was held'
-        raise entry.error("forward", "forward capsule needs a capsule that is free to move", "held", remedy)
-    model = DecayModel.stated(settings)
-    if model != DecayModel() or settings.samples != "record":
-        rule = "forward capsule has viscous damping, a linear spring and white noise only"
-        remedy = 'write forward = "closed", or remove damping, stiffness, drift and noise'
-        raise entry.error("forward", rule, model.name, remedy)
-
-
-def _check_channels(entry: Entry[DecaySettings]) -> None:
-    """Require x_rel alone for turning points and for the capsule model."""
-    settings, names = entry.table.settings, set(CHANNELS).intersection(entry.table.columns)
-    for key, value, needs in (
-        ("samples", settings.samples, "turning_points"),
-        ("forward", settings.forward, "capsule"),
+    for stated, key, rule in (
+        (settings.stiffness == "cubic", "slope", "a decay with a cubic spring must be on level ground"),
+        *(
+            (
+                settings.capsule == "free",
+                key,
+                f'the closed form of a free capsule has no {key}; forward = "capsule" has',
+            )
+            for key in ("slope", "N0")
+        ),
     ):
-        if value == needs and names != {"x_rel"}:
-            found = " ".join(sorted(names))
-            raise entry.error(key, f'{key} = "{needs}" needs x_rel and no other channel', found, "map x_rel only")
+        if stated and settings.forward == "closed":
+            entry.refuse_ground(key, rule)
+    for stated, *words in _faults(entry):
+        if stated:
+            raise entry.error(*words)
 
 
+#: Fewest block means in a period.
+FEWEST_MEANS = 4
 #: Largest distance of an interval between turning points from a multiple of the median one, relative to that.
 UNEQUAL = 0.25
-
-
-def _check_turning_points(entry: Entry[DecaySettings]) -> None:
-    """Refuse drift, coloured noise and thinning of turning points."""
-    settings = entry.table.settings
-    if settings.samples == "record":
-        return
-    for key, default in (("drift", "none"), ("noise", "white"), ("thin", 1)):
-        value = getattr(settings, key)
-        if value not in (None, default):
-            rule = "turning points have white noise and no drift, and each of them counts"
-            raise entry.error(key, rule, str(value), f"remove {key}, or samples", of_key=True)
 
 
 def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
@@ -172,10 +196,10 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
         place, channel = (Path(table.file), int(table.rows[0])), channel_of(table)
         rule = f"{channel} must pass its rest position, or show how it comes to rest there by damping"
         fit = viscous_fit(time, values)
-        if likelihood_gain(fit, viscous_fit(time, values, held=CHANNELS[channel].order)) > BETTER:
+        if likelihood_gain(fit, viscous_fit(time, values, 3, CHANNELS[channel].order)) > BETTER:
             value = f"one stroke of {len(values)} samples, after which dry friction holds the rod"
             raise InputError(rule, value, "release it from a larger deflection, or reduce the friction", *place)
-        if likelihood_gain(exponential_fit(time, values), fit) < 2.0 * BETTER:
+        if likelihood_gain(viscous_fit(time, values, 1), fit) < 2.0 * BETTER:
             remedy = (
                 'where each row is a turning point, state samples = "turning_points"; else record from the release on, with '
                 "at least 10 samples before the rod is at half its deflection"
@@ -224,12 +248,15 @@ def _make(table: Table[DecaySettings], rig: Rig, friction: Any) -> tuple[Any, ..
 
 def _channel_tables(table: Table[DecaySettings]) -> list[Table[DecaySettings]]:
     """Return a table for each channel; its fit has initial conditions of its own, which loses little."""
-    first, *others = [name for name in CHANNELS if name in table.columns]
-    tables = [replace(table, columns={name: table.columns[name] for name in ("time", first)})]
-    for name in others:
-        columns = {own: table.columns[own] for own in ("time", name)}
-        tables.append(replace(table, columns=columns, label=f"{table.label}_{name}"))
-    return tables
+    names = [name for name in CHANNELS if name in table.columns]
+    return [
+        replace(
+            table,
+            columns={own: table.columns[own] for own in ("time", name)},
+            label=table.label if name == names[0] else f"{table.label}_{name}",
+        )
+        for name in names
+    ]
 
 
 def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
@@ -306,12 +333,7 @@ KIND = Kind(
     settings=DecaySettings,
     rules=(
         Entry.check_spring_with_gap,
-        check_ground,
-        _check_channels,
-        _check_window,
-        _check_forward,
-        _check_turning_points,
-        check_thin,
+        _check_settings,
     ),
     masses=_masses,
     parameters=(

@@ -111,8 +111,16 @@ class Decrement:
     c: float
 
     @classmethod
-    def of(cls, times: np.ndarray, peaks: np.ndarray, Omega_o: float, delta: float, m1: float) -> "Decrement":
-        """The paper's estimates from frequency and decrement, of a rod of mass ``m1``, kg."""
+    def of(
+        cls, index: np.ndarray, times: np.ndarray, peaks: np.ndarray, m1: float, smallest: float = 0.0
+    ) -> "Decrement":
+        """The paper's estimates from the peaks with these numbers of half periods (p,), of a rod of mass ``m1``, kg.
+
+        The decrement is that of the peaks larger than ``smallest`` times the largest one.
+        """
+        used = np.abs(peaks) > smallest * np.max(np.abs(peaks))
+        Omega_o = float(np.pi / np.polyfit(index, times, 1)[0])
+        delta = float(-2.0 * np.polyfit(index[used], np.log(np.abs(peaks[used])), 1)[0])
         k1 = m1 * Omega_o**2
         return cls(times, peaks, Omega_o, delta, k1, delta / np.pi * float(np.sqrt(k1 * m1)))
 
@@ -188,10 +196,7 @@ def logarithmic_decrement(
     times, peaks = half_cycle_extremes(time, guide, values - rest, lowest)
     if len(times) < 3:
         return None
-    index = np.arange(len(times))
-    Omega_o = float(np.pi / np.polyfit(index, times, 1)[0])
-    delta = float(-2.0 * np.polyfit(index, np.log(np.abs(peaks)), 1)[0])
-    return Decrement.of(times, peaks, Omega_o, delta, m1)
+    return Decrement.of(np.arange(len(times)), times, peaks, m1)
 
 
 class ViscousFit(NamedTuple):
@@ -219,11 +224,6 @@ class ViscousFit(NamedTuple):
         """Damping ratio."""
         return self.gamma / self.omega
 
-    @property
-    def fastest(self) -> float:
-        """Rate of the fastest change, rad/s or 1/s: beyond critical damping that of the faster exponential."""
-        return self.omega * (1.0 if self.ratio < 1.0 else self.ratio + float(np.sqrt(self.ratio**2 - 1.0)))
-
     def decrement(self, m1: float) -> Decrement:
         """Values of the fit in place of the paper's; its peak is the last turning point before the record, or its start."""
         time, peak = 0.0, float(self.parts[0])
@@ -240,7 +240,7 @@ class ViscousFit(NamedTuple):
         return Decrement(np.array([time]), np.array([peak]), self.omega, delta, m1 * self.square, 2.0 * m1 * self.gamma)
 
 
-def viscous_fit(time: np.ndarray, values: np.ndarray, held: int | None = None) -> ViscousFit:
+def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: int = 0) -> ViscousFit:
     """Fit a viscous decay of any damping to a record of displacements, velocities or accelerations.
 
     Its motions and the offset are linear. Frequency and damping ratio are searched on a grid, and about the highest peak
@@ -249,8 +249,9 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, held: int | None = None) -
     Parameters
     ----------
     time, values : (n,) s, increasing, and readings
-    held : fit a single stroke instead, after which dry friction holds the rod, to this derivative of x_rel; the time of
-        its stop is searched too
+    unknowns : that are searched. 2: a decay. 1: one exponential, which a far overdamped decay leaves of its motion. 3: a
+        single stroke, after which dry friction holds the rod; the time of its stop is searched too
+    order : of the derivative of x_rel that a stroke is fitted to
     """
     time, size = time - time[0], float(np.std(values)) or 1.0
     rest = np.mean(values[-max(len(values) // 5, 4) :])
@@ -263,46 +264,32 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, held: int | None = None) -
     tried = [*itertools.product(near[near > 0.0], LIGHT_RATIOS), *itertools.product(wide, STRONG_RATIOS)]
 
     def fitted(z: np.ndarray, part: slice) -> ViscousFit:
-        omega, ratio, *share = np.exp(z)
+        omega, ratio, share = np.exp([*z, np.inf, np.inf][:3])
         t = time[part]
-        if held is None:
+        if unknowns == 1:
+            basis = np.exp(-omega * t)
+        elif unknowns == 2:
             basis = viscous_basis(t, omega**2, 2.0 * ratio * omega, 1.0, np)
         else:  # backwards in time from the stop, at a share of the half period, damping is negative
-            left = share[0] * np.pi / (omega * np.sqrt(1.0 - ratio**2)) - t
+            left = share * np.pi / (omega * np.sqrt(1.0 - ratio**2)) - t
             basis = viscous_basis(np.maximum(left, 0.0), omega**2, -2.0 * ratio * omega, 1.0, np)
-            basis = (basis[:, :1], basis[:, 1:], basis * (left > 0.0)[:, None])[held]
+            basis = (basis[:, :1], basis[:, 1:], basis * (left > 0.0)[:, None])[order]
         design = np.column_stack([basis, np.ones(len(t))])
         parts = np.linalg.lstsq(design, values[part])[0]
         return ViscousFit(float(ratio * omega), float(omega**2), parts, values[part] - design @ parts)
 
-    unknowns = 2 if held is None else 3
     few, fine = (slice(0, end, -(-end // most)) for most in (MOST_SEARCHED, MOST_REFINED))
-    points = [np.log([*pair, 0.9])[:unknowns] for pair in tried if held is None or pair[1] < LARGEST_RATIO]
-    starts = sorted(points, key=lambda z: float(np.sum(fitted(z, few).left ** 2)))[:REFINED]
-    strongest = LARGEST_SEARCHED if held is None else LARGEST_RATIO
+    strongest = LARGEST_SEARCHED if unknowns == 2 else LARGEST_RATIO
+    points = {
+        tuple(np.log([*pair, 0.9])[:unknowns]): None for pair in tried if unknowns == 2 or pair[1] < LARGEST_RATIO
+    }
+    starts = sorted(points, key=lambda z: float(np.sum(fitted(np.array(z), few).left ** 2)))[:REFINED]
     low, high = np.log([[0.1 * SLOWEST / length, SMALLEST_RATIO, 0.01], [np.pi / step, strongest, 1.0]])[:, :unknowns]
     ends = [
         least_squares(lambda z: fitted(z, fine).left / size, np.clip(z, low, high), bounds=(low, high), x_scale=0.1)
         for z in starts
     ]
     return fitted(min(ends, key=lambda one: one.cost).x, slice(None))
-
-
-def exponential_fit(time: np.ndarray, values: np.ndarray) -> ViscousFit:
-    """Fit one exponential and an offset: what a far overdamped decay leaves of its motion; parameters as ``viscous_fit``."""
-    time = time - time[0]
-
-    def fitted(logarithm: float) -> ViscousFit:
-        rate = float(np.exp(logarithm))
-        design = np.stack([np.exp(-rate * time), np.ones_like(time)], axis=1)
-        parts = np.linalg.lstsq(design, values)[0]
-        return ViscousFit(np.inf, np.inf, parts, values - design @ parts)
-
-    grid = np.log(np.geomspace(0.1, 10.0 * len(time), WIDE_POINTS) / time[-1])
-    best = min(range(1, WIDE_POINTS - 1), key=lambda i: float(np.sum(fitted(grid[i]).left ** 2)))
-    low, high = grid[best - 1], grid[best + 1]
-    found = least_squares(lambda z: fitted(z[0]).left / np.std(values), grid[best : best + 1], bounds=(low, high))
-    return fitted(found.x[0])
 
 
 def likelihood_gain(one: ViscousFit, other: ViscousFit) -> float:
@@ -352,8 +339,8 @@ def damping_of_peaks(decrement: Decrement, m1: float, deflection: float, symbols
     return dict(zip(chosen, (float(part) for part in parts), strict=True))
 
 
-def _drift(values: np.ndarray) -> tuple[float, float, bool]:
-    """Slopes per half cycle of a parabola through ``values`` (p,) at both ends, and whether they differ.
+def _ends(values: np.ndarray) -> np.ndarray:
+    """Slopes (2,) per half cycle of a parabola through ``values`` (p,) at both ends; NaN where they do not differ.
 
     The difference counts where it exceeds the scatter of the values.
     """
@@ -362,8 +349,8 @@ def _drift(values: np.ndarray) -> tuple[float, float, bool]:
     rest = values - np.polyval(coefficients, index)
     design = np.vander(index, 3)
     variance = float(rest @ rest) / (len(values) - 3) * np.linalg.inv(design.T @ design)[0, 0]
-    first, last = np.polyval(np.polyder(coefficients), index[[0, -1]])
-    return float(first), float(last), bool(abs(coefficients[0]) > REPORTED * np.sqrt(variance))
+    drifts = abs(coefficients[0]) > REPORTED * np.sqrt(variance)
+    return np.polyval(np.polyder(coefficients), index[[0, -1]]) if drifts else np.full(2, np.nan)
 
 
 def trend(decrement: Decrement, noise: float) -> Facts:
@@ -386,13 +373,8 @@ def trend(decrement: Decrement, noise: float) -> Facts:
     # Neighbouring peaks lie on opposite sides of the equilibrium, so their mean cancels its error.
     size = 0.5 * (height[1:count] + height[: count - 1])
     middle = 0.5 * (decrement.times[1:count] + decrement.times[: count - 1])
-    facts = {}
-    first, last, drifts = _drift(np.log(size))
-    if drifts:
-        facts["decrement"] = (-2.0 * first, -2.0 * last)
-    first, last, drifts = _drift(middle)
-    if drifts:
-        facts["frequency"] = (np.pi / first, np.pi / last)
+    found = {"decrement": -2.0 * _ends(np.log(size)), "frequency": np.pi / _ends(middle)}
+    facts = {name: tuple(ends.tolist()) for name, ends in found.items() if np.isfinite(ends).all()}
     return {"amplitude": (float(size[0]), float(size[-1])), **facts} if facts else {}
 
 

@@ -1,20 +1,308 @@
-"""Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c."""
+"""Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c, their checks and tables."""
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import ndimage, stats
 
-from capsule_id.experiments.base import Start
-from capsule_id.experiments.checks import refit
-from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.free_vibration.checks import CHECKS, later_start, stiffness_by_record
-from capsule_id.experiments.free_vibration.hidden_terms import check_hidden_terms
-from capsule_id.experiments.free_vibration.record import DecayRecord
-from capsule_id.experiments.free_vibration.second_fit import decay_starts, nested_starts, second_models
-from capsule_id.records.tones import other_tone
-from capsule_id.views import Facts, Finding, ResultTable
+from capsule_id.experiments.base import Start, ValuesBySymbol
+from capsule_id.experiments.checks import LEVEL, refit
+from capsule_id.experiments.context import Check, Fitted
+from capsule_id.experiments.free_vibration.decrement import equilibrium
+from capsule_id.experiments.free_vibration.hidden_terms import (
+    check_hidden_terms,
+    further_columns,
+    sensitivities,
+    zero_jumps,
+)
+from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
+from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
+from capsule_id.experiments.free_vibration.second_fit import Screening, decay_starts, nested_starts, second_models
+from capsule_id.parameters import parameter
+from capsule_id.records.duplicates import reading_step
+from capsule_id.records.faults import sampling
+from capsule_id.records.tones import length_of_motion, other_tone
+from capsule_id.rig.filters import median_step
+from capsule_id.views import Facts, Finding, Level, ResultTable
+
+#: Joint sds apart from which halves of a record disagree, and from which that fails.
+HALVES_DISAGREE, HALVES_FAIL = 3.0, 4.0
+#: Fewest readings and half cycles of a half; fewest half cycles that a later start leaves.
+FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
+#: Intervals of position in each direction of the motion, and fewest readings per interval.
+INTERVALS, READINGS_PER_INTERVAL = 12, 5
+#: Largest part of a drift that is as fast as the motion, relative to the motion.
+FAST_DRIFT = 0.01
+#: Largest part of a drift that is as fast as the motion, relative to the residuals left: about half of what white noise gives.
+FAST_NOISE = 0.25
+#: Distance from 0, in sds, of a force that a second fit has found and that counts as seen.
+FARTHER = 3.0
+#: Smallest ratio of the residuals of the larger half of the amplitudes to those of the smaller half that counts.
+LARGER = 1.3
+#: Steps of the readings in which a motion is lost, and fewest readings before that.
+STEPS, FEWEST_SIZES = 3.0, 30
+
+
+#: A judge of one decay at its values by symbol: facts, and a level or a p-value; None where it cannot be judged.
+Judge = Callable[[Any, ValuesBySymbol], tuple[Facts, Level | float] | None]
+
+
+def each(code: str, judge: Judge, joined: bool = True) -> Check:
+    """Return the check that judges every decay; a p-value below ``LEVEL`` over the number of decays fails.
+
+    Parameters
+    ----------
+    joined : report those that pass in one finding, where all do, with their labels and their smallest p-value
+    """
+
+    def check(decays: Sequence[Decay], fit: Fitted) -> list[Finding]:
+        judged = [(e, *found) for e in decays if (found := judge(e, e.local(fit.values))) is not None]
+        findings = list[Finding]()
+        for e, facts, found in judged:
+            level = found if isinstance(found, str) else "fail" if found * len(judged) < LEVEL else "ok"
+            if level != "ok" or not joined:
+                findings.append(Finding(code, level, {"label": e.label, **facts}, e.label))
+        if judged and not findings:
+            least = {"p": min(facts["p"] for _, facts, _ in judged)} if "p" in judged[0][1] else {}
+            findings.append(Finding(code, "ok", {"labels": ", ".join(e.label for e, *_ in judged), **least}))
+        return findings
+
+    return check
+
+
+def check_stiffness(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
+    """Check that k1 of single records does not depend on amplitude (the paper's "linear near the working point")."""
+    if len(records) < 2:
+        return []
+    k1, sd, _ = stiffness_by_record(records, fit.values)
+    weight = sd**-2.0
+    mean = np.average(k1, weights=weight)
+    q = float(np.sum(weight * (k1 - mean) ** 2))
+    p = float(stats.chi2.sf(q, len(records) - 1))
+    facts = {"records": len(records), "low": k1.min(), "high": k1.max(), "chi_square": q, "p": p}
+    return [Finding("decays.stiffness", "fail" if p < LEVEL else "ok", facts)]
+
+
+def stiffness_by_record(
+    records: Sequence[DecayRecord], values: Mapping[str, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Estimate k1, its standard error and the largest deflection of every record, (records,) SI."""
+    estimates = [refit(e, e.local(values), [])["k1"] for e in records]
+    k1, sd = (np.array(column) for column in zip(*estimates, strict=True))
+    return k1, sd, np.array([e.largest_deflection for e in records])
+
+
+def check_free_decay(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
+    """Check that a free capsule does not slip and that the rod does not touch the support spring."""
+    findings, theta = [], fit.values
+    for e in records:
+        needed = {"m2", *(row.symbol for row in e.friction.parameters_at_rest)}
+        if e.table.settings.capsule == "free" and needed <= set(theta):
+            force = e.largest_force(theta)
+            threshold = float(e.friction.force(theta).forward(0.0))
+            if force > threshold:
+                findings.append(Finding("decays.slip", "fail", {"force": force, "F_b": threshold}, e.label))
+        gap = e.table.settings.gap
+        reach = float(np.max(e.values - equilibrium(e.values))) if e.order == 0 else e.largest_deflection
+        if gap is not None and reach >= gap.value:
+            findings.append(Finding("decays.contact", "fail", {"reach": reach, "gap": gap.value}, e.label))
+    return findings
+
+
+#: Value of each parameter in both halves, their difference over its sd, and whether that matters; {} for a short decay.
+Changes = Callable[[Any, ValuesBySymbol], Mapping[str, tuple[float, float, float, bool]]]
+
+
+def halves(changes: Changes) -> Check:
+    """Return the check that both halves of every decay give the same parameters, where it is long enough."""
+
+    def judge(e: Decay, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
+        found = changes(e, theta)
+        if not found:
+            return None
+        name = max(found, key=lambda name: abs(found[name][2]))
+        first, second, z, matters = found[name]
+        facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
+        level = "ok" if not abs(z) > HALVES_DISAGREE else "fail" if abs(z) > HALVES_FAIL and matters else "warn"
+        return {**facts, "model": e.model_name, "stated": e.stated_words}, level
+
+    return each("decays.halves", judge)
+
+
+def changes_of_second_half(e: DecayRecord, theta: ValuesBySymbol) -> dict[str, tuple[float, float, float, bool]]:
+    """See ``Changes``: fits of both halves of a record."""
+    found = [_estimates(half, theta) for half in _halves(e)]
+    if not found:
+        return {}
+    (first, first_sd), (second, second_sd) = found
+    sd = {name: np.hypot(first_sd[name], second_sd[name]) for name in first}
+    return {name: (first[name], second[name], float((second[name] - first[name]) / sd[name]), True) for name in first}
+
+
+def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
+    """State the lowest alias of the records with even samples, which cannot exclude it."""
+    found = ((e.label, *sampling(decay_window(e.table)[0])) for e in records)
+    rates = {label: rate for label, rate, even in found if even}
+    if not rates or "m1" not in fit.values:
+        return []
+    k1 = (2.0 * np.pi * min(rates.values()) * np.sqrt(fit.values["m1"]) - np.sqrt(fit.values["k1"])) ** 2
+    facts = {"labels": ", ".join(rates), "other": float(np.sqrt(k1 / fit.values["m1"])) / (2.0 * np.pi), "k1": k1}
+    return [Finding("decays.alias", "ok", facts)]
+
+
+def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
+    """Check that the forces that a second fit has chosen, and no setting states, are far from 0 in the sample."""
+    found = {symbol: e for e in records if e.replaced for symbol in e.model.symbols} if fit.draws else {}
+    draws = {symbol: np.array([draw[symbol] for draw in fit.draws]) for symbol in found}
+    z = {symbol: float(abs(np.mean(values)) / np.std(values)) for symbol, values in draws.items()}
+    return [
+        Finding(
+            "decays.found",
+            "warn",
+            {"label": e.label, "name": symbol, "z": z[symbol], "effect": EFFECTS[symbol]},
+            e.label,
+            (symbol,),
+        )
+        for symbol, e in found.items()
+        if z[symbol] < FARTHER
+    ]
+
+
+def drift(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
+    """Judge whether a Gaussian-process drift is slow: its part at the frequency of the decay hides errors of the model."""
+    if e.model.drift != "gp":
+        return None
+    half = np.pi * np.sqrt(theta["m1"] / theta["k1"])
+    raw, design = e.unwhitened(theta, np)
+    residuals = raw - design @ np.linalg.lstsq(e.whitened(theta, design), e.whitened(theta, raw), rcond=None)[0]
+    shape = {symbol: theta[symbol] for symbol in e.model.shapes}
+    slow = np.asarray(drift_by_shape(e.times, np.asarray(residuals), e.model.noise, shape))
+    curve = e.values - residuals
+    fast, motion = fast_rms(e.time, slow, half), fast_rms(e.time, curve, half)
+    if fast is None or motion is None:
+        return None
+    noise, larger = FAST_NOISE * float(np.std(residuals - slow)), bool(np.std(slow) > np.std(curve))
+    level = "fail" if larger or fast > max(FAST_DRIFT * motion, noise) else "ok"
+    return {"larger": larger, "share": fast / max(motion, noise), **later_start(e)}, level
+
+
+def size_of_residuals(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | None:
+    """Judge whether the residuals are larger where the motion is larger: fitted noise then holds an error of the model.
+
+    Spearman's rank correlation of their sizes with the amplitude, before the motion is lost in the steps of the readings.
+    """
+    size = np.abs(e.values - equilibrium(e.values))
+    moving = np.flatnonzero(size >= STEPS * reading_step(e.whole[1]))
+    n = int(moving[-1]) + 1 if len(moving) else 0
+    if n < FEWEST_SIZES:
+        return None
+    residuals = np.abs(np.asarray(e.residuals(theta, np))[:n])
+    period = 2.0 * np.pi / e.rough.Omega_o / median_step(e.time)
+    amplitude = ndimage.maximum_filter1d(size[:n], max(3, round(period)))
+    if np.ptp(amplitude) == 0.0 or np.ptp(residuals) == 0.0:
+        return None
+    large = amplitude > np.median(amplitude)
+    large = large if large.any() else amplitude == np.max(amplitude)
+    ratio = float(np.sqrt(np.mean(residuals[large] ** 2) / np.mean(residuals[~large] ** 2)))
+    trend = stats.spearmanr(amplitude, residuals, alternative="greater")
+    p = float(trend.pvalue)  # pyright: ignore[reportAttributeAccessIssue]  (SciPy types the result as a tuple)
+    return {"ratio": ratio, "p": p, "stated": e.stated_words, **later_start(e)}, p if ratio > LARGER else 1.0
+
+
+def later_start(e: DecayRecord) -> Facts:
+    """Time from which the amplitudes are below half the largest one: ``start``, s, None where too few swings are left."""
+    size = np.abs(e.values - equilibrium(e.values))
+    begin = int(np.flatnonzero(size > 0.5 * np.max(size))[-1]) + 1
+    left = e.time[begin:][: length_of_motion(e.values[begin:])] if begin < len(e.time) else e.time[:0]
+    if len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_CYCLES:
+        return {"start": None}
+    digits = max(0, int(np.ceil(-np.log10(median_step(e.time)))))
+    return {"start": float(np.round(decay_window(e.table)[0][0] + e.time[begin], digits))}
+
+
+def fast_rms(time: np.ndarray, values: np.ndarray, half: float) -> float | None:
+    """Rms of the part of ``values`` that turns its sign every ``half`` seconds.
+
+    A filter with gain 1 there and 0 for a straight line reads one period to each side of a sample. None where the samples
+    with both sides cover less than one period.
+    """
+    inside = (time > time[0] + 2.0 * half) & (time < time[-1] - 2.0 * half)
+    if not inside.any() or np.ptp(time[inside]) < 2.0 * half:
+        return None
+    for _ in range(2):
+        before, after = (np.interp(time + shift, time, values) for shift in (-half, half))
+        values = 0.5 * (values - 0.5 * (before + after))
+    return float(np.sqrt(np.mean(values[inside] ** 2)))
+
+
+def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | None:
+    """Judge whether the residuals depend on the position of the rod and the direction of its motion.
+
+    The F test for offsets of the readings by interval of position and direction; the interval with the largest offset is
+    stated. None for too few readings.
+    """
+    # The acceleration jumps where the rod turns.
+    if e.n < 2 * READINGS_PER_INTERVAL or (e.order == 2 and "dry" in e.model.damping):
+        return None
+    left, design, moved = sensitivities(e, theta)
+    # At rest the last digits of this difference depend on the residuals, and must not choose the interval.
+    curve = np.round((e.values - left) / np.ptp(e.values), 9) * np.ptp(e.values)
+    offsets, limits = [], []
+    number = min(INTERVALS, len(curve) // (2 * READINGS_PER_INTERVAL))
+    for ahead in (np.gradient(curve, e.time) > 0.0, np.gradient(curve, e.time) <= 0.0):
+        if not ahead.any():
+            continue
+        edges = np.quantile(curve[ahead], np.linspace(0.0, 1.0, number + 1))
+        place = np.clip(np.searchsorted(edges, curve, side="right") - 1, 0, number - 1)
+        offsets += [ahead & (place == i) for i in range(number)]
+        limits += list(itertools.pairwise(edges))
+    known = np.column_stack([design, *moved.values()])
+    p, effects = further_columns(*(e.whitened(theta, x) for x in (known, np.stack(offsets, axis=1), left)))
+    if p is None:
+        return None
+    low, high = np.array(limits[np.argmax(np.abs(effects))]) * e.column.to_display
+    return {"p": p, "low": float(low), "high": float(high), "unit": e.column.unit, **later_start(e)}, p
+
+
+def _halves(e: DecayRecord) -> list[DecayRecord]:
+    """The first and the second half of the part of ``e`` whose peaks exceed its noise; [] for a short one."""
+    decrement = e.decrement()
+    # The acceleration jumps where the rod turns, so difference quotients give no standard errors.
+    jumps = e.order == 2 and "dry" in e.model.damping
+    if decrement is None or len(decrement.times) < 2 * FEWEST_HALF_CYCLES or jumps:
+        return []
+    time = e.whole[0][e.whole[0] <= decrement.times[-1]]
+    if len(time) < 2 * FEWEST_READINGS * e.model.thin:
+        return []
+    begin = float(decay_window(e.table)[0][0])
+    middle, end = begin + float(time[len(time) // 2]), begin + float(time[-1])
+    settings = e.table.settings
+    spans = (replace(settings, start=begin, stop=middle), replace(settings, start=middle, stop=end))
+    tables = [replace(e.table, settings=span) for span in spans]
+    return [type(e)(table, e.rig, e.friction, e.model) for table in tables]
+
+
+def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
+    """Estimates and standard errors of the physical parameters from one half, from the values ``theta`` of the whole."""
+    if half.closed and not half.model.whitened:
+        pairs = refit(half, theta, [])
+        return {name: v for name, (v, _) in pairs.items()}, {name: sd for name, (_, sd) in pairs.items()}
+    screening = Screening(half, k1=theta["k1"])
+    found, _ = screening.fit(half.model, screening.scaled(theta))
+    names = ("k1", "c", *half.model.symbols)
+    return {name: found.values[name] for name in names}, {name: found.errors[name] for name in names}
+
+
+check_halves = halves(changes_of_second_half)
+check_positions = each("decays.position", position)
+check_size_of_residuals = each("decays.residuals", size_of_residuals)
+check_drift = each("decays.drift", drift, joined=False)
+check_zero = each("decays.zero", zero_jumps)
+
 
 # tables: Views of free decays: estimates by record, and correlations of the damping.
 
@@ -55,7 +343,18 @@ def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Resul
 class FreeVibration(DecayRecord):
     """One channel of one raw record, with its checks, tables and starts."""
 
-    checks = (*CHECKS, check_hidden_terms)
+    checks = (
+        check_stiffness,
+        check_free_decay,
+        check_halves,
+        check_aliases,
+        check_positions,
+        check_size_of_residuals,
+        check_found_forces,
+        check_drift,
+        check_zero,
+        check_hidden_terms,
+    )
     tables = (decay_table, damping_table)
 
     @classmethod

@@ -15,9 +15,7 @@ from capsule_id.experiments.free_vibration.readings import (
     KINEMATIC_MESSAGES,
     MOST_PERIODS,
     DecayModel,
-    DecaySettings,
     block_size,
-    decay_window,
     default_block_size,
     first_periods,
     lint_kinematics,
@@ -40,8 +38,8 @@ from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.schema import SHORTEST_RECORD, Entry
-from capsule_id.views import Facts, Finding, Message, counted, filled_in
+from capsule_id.rig.schema import SHORTEST_RECORD
+from capsule_id.views import Facts, Finding, Level, Message, filled_in
 
 # lint: Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any
 # record.
@@ -59,8 +57,6 @@ USUAL_K1 = (1500.0, 1000.0)
 PROPOSED_FACTOR = 10
 #: Smallest number of periods; with fewer, one peak determines the damping.
 FEWEST_PERIODS = 2
-#: Fewest block means in a period.
-FEWEST_MEANS = 4
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
@@ -94,7 +90,6 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         faults = faults or [*lint_kinematics(table, used, period)]
     yield from _named(table, release, faults)
     window = time[used], table[channels[0]][used]
-    yield from _thinned(table, *window)
     yield from _sampling(table, *window)
     if not faults:
         yield from _frequency(table, rig, *window)
@@ -196,69 +191,68 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
         yield Finding("decays.sampling", "warn", facts, table.label, ("k1",))
 
 
+#: A finding that may hold: whether it does, its code, level and facts, and its parameters.
+Row = tuple[Any, str, Level, Facts, tuple[str, ...]]
+
+
+def _held(table: Table[Any], rows: Iterable[Row]) -> Iterable[Finding]:
+    """The findings of the ``rows`` that hold."""
+    yield from (Finding(code, level, facts, table.label, own) for holds, code, level, facts, own in rows if holds)
+
+
 def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Finding]:
     """Report rest before the release, and a second excitation; a ``faulty`` record may feign the latter."""
     start, stop = release_time(decay), decay.stop
     earlier = stop is not None and decay.end is None
-    if decay.rest > 0.0 and not earlier:
-        before = "slow approach to the first turning point" if decay.pushed else "rest or excitation"
-        longer = "" if decay.pushed else ". To keep a longer part, state an earlier start."
-        facts = {"file": table.file, "rest": decay.rest, "start": start, "found": decay.start, "before": before}
-        facts |= {"longer": longer}
-        yield Finding("decays.release", "warn" if table.settings.start is None else "fail", facts, table.label)
-    if stop is not None and not faulty:
-        digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
-        other = " For the part after that, add instead: " + line_of("start").format(start=start) if earlier else ""
-        facts = {"file": table.file, "stop": round(stop, digits), "found": stop, "other": other}
-        yield Finding("decays.second", "fail", facts, table.label)
-
-
-def check_thin(entry: Entry[DecaySettings]) -> None:
-    """Require block means that leave a record, and that follow its oscillation.
-
-    Raises
-    ------
-    InputError
-        At ``thin``.
-    """
-    thin = entry.table.settings.thin
-    if thin is None or thin == 1:
-        return
-    time, values = decay_window(entry.table)
-    most = min(len(time) // SHORTEST_RECORD, max(block_size(time, values, FEWEST_MEANS), 2))
-    if thin > most:
-        rule = f"thin must leave {SHORTEST_RECORD} means of the record and {FEWEST_MEANS} means in a period"
-        remedy = f"write thin = {most} or less" if most > 1 else "remove thin"
-        raise entry.error("thin", rule, f"{thin} of {counted(len(time), 'sample')}", remedy)
-
-
-def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
-    """Report that a long record is fitted by block means, where the settings leave that open."""
-    thin, settings = default_block_size(time, values), table.settings
-    if settings.thin is None and settings.forward == "closed" and thin > 1:
-        wider = "less than 0.5 %" if thin <= block_size(time, values) else "some 3 %"
-        facts = {"file": table.file, "samples": len(time), "thin": thin, "means": len(time) // thin, "wider": wider}
-        yield Finding("decays.thinned", "ok", facts, table.label)
-    cut = first_periods(table).settings.stop
-    if DecayModel.stated(settings).slow and cut != settings.stop:
-        yield Finding("decays.long", "warn", {"file": table.file, "stop": cut, "periods": MOST_PERIODS}, table.label)
+    rest: Facts = {
+        "file": table.file,
+        "rest": decay.rest,
+        "start": start,
+        "found": decay.start,
+        "before": "slow approach to the first turning point" if decay.pushed else "rest or excitation",
+        "longer": "" if decay.pushed else ". To keep a longer part, state an earlier start.",
+    }
+    digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
+    other = " For the part after that, add instead: " + line_of("start").format(start=start) if earlier else ""
+    second: Facts = {"file": table.file, "stop": round(stop or 0.0, digits), "found": stop, "other": other}
+    stated = table.settings.start is not None
+    rows: tuple[Row, ...] = (
+        (decay.rest > 0.0 and not earlier, "decays.release", "fail" if stated else "warn", rest, ()),
+        (stop is not None and not faulty, "decays.second", "fail", second, ()),
+    )
+    yield from _held(table, rows)
 
 
 def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
-    """Report uneven sampling, and too few samples per period or periods."""
+    """Report block means in place of the samples, uneven sampling, and too few samples per period or periods."""
+    settings, thin, cut = table.settings, default_block_size(time, values), first_periods(table).settings.stop
     frequency, (rate, even) = decay_frequency(time, values), sampling(time)
+    periods, per_period = (time[-1] - time[0]) * frequency, rate / frequency
+    uneven = dict[str, Any]()
     try:
         sampling_step(time)
     except InputError as error:
-        yield Finding("decays.uneven", "warn", {"rule": error.rule, "value": error.value}, table.label)
-        if not even:
-            return
-    if rate / frequency < SAMPLES_PER_PERIOD:
-        facts = {"samples": rate / frequency, "wanted": SAMPLES_PER_PERIOD, "other": ""}
-        yield Finding("decays.sampling", "warn", facts, table.label, ("k1",) if even else ())
-    if (time[-1] - time[0]) * frequency < FEWEST_PERIODS:
-        facts = {"periods": (time[-1] - time[0]) * frequency, "wanted": FEWEST_PERIODS}
-        yield Finding("decays.length", "warn", facts, table.label)
+        uneven = {"rule": error.rule, "value": error.value}
+    means: Facts = {
+        "file": table.file,
+        "samples": len(time),
+        "thin": thin,
+        "means": len(time) // thin,
+        "wider": "less than 0.5 %" if thin <= block_size(time, values) else "some 3 %",
+    }
+    by_means = settings.thin is None and settings.forward == "closed" and thin > 1
+    longer = DecayModel.stated(settings).slow and cut != settings.stop
+    few: Facts = {"samples": per_period, "wanted": SAMPLES_PER_PERIOD, "other": ""}
+    short: Facts = {"periods": periods, "wanted": FEWEST_PERIODS}
+    counted = even or not uneven
+    rows: tuple[Row, ...] = (
+        (by_means, "decays.thinned", "ok", means, ()),
+        (longer, "decays.long", "warn", {"file": table.file, "stop": cut, "periods": MOST_PERIODS}, ()),
+        (bool(uneven), "decays.uneven", "warn", uneven, ()),
+        (counted and per_period < SAMPLES_PER_PERIOD, "decays.sampling", "warn", few, ("k1",) if even else ()),
+        (counted and periods < FEWEST_PERIODS, "decays.length", "warn", short, ()),
+    )
+    yield from _held(table, rows)
 
 
 def line_of(key: str) -> str:
@@ -411,40 +405,27 @@ def _forces(facts: Facts) -> str:
     )
 
 
-def _smaller(facts: Facts) -> str:
-    """How to leave out the large amplitudes of a record."""
-    if facts["start"] is None:
-        return "record again from smaller deflections"
-    line = filled_in(line_of("start"), facts)
-    return f"leave out the larger half of the amplitudes: add {line} to the experiment in rig.toml"
-
-
-def _position(facts: Facts) -> str:
-    seen = (
-        "{label}: the residuals must not depend on the position of the rod, but they do ({p:p}), most from {low:.4g} to "
-        "{high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the sensor, or "
-    )
-    return filled_in(seen, facts) + f"{_smaller(facts)}."
-
-
-def _residuals(facts: Facts) -> str:
-    seen = (
-        "{label}: the residuals must not be larger where the motion is larger, but they are, {ratio:.1f} times ({p:p}). "
-        "What was fitted as noise is an error of the model there, such as a stiffness or a damping that depends on the "
-        "amplitude, or an error of the sensor in proportion to the motion. To find the cause, "
-    )
-    return filled_in(seen, facts) + f"{_smaller(facts)}, and compare the results."
+def _with_smaller(text: str, facts: Facts) -> str:
+    """``text`` with how to leave out the large amplitudes of a record in the place of ``{smaller}``."""
+    smaller = "record again from smaller deflections"
+    if facts["start"] is not None:
+        line = filled_in(line_of("start"), facts)
+        smaller = f"leave out the larger half of the amplitudes: add {line} to the experiment in rig.toml"
+    return filled_in(text, {**facts, "smaller": smaller})
 
 
 def _drift(facts: Facts) -> str:
-    if facts["larger"]:
-        seen = "{label}: the fitted drift of the zero is larger than the motion, so the motion may be part of it. "
-        return filled_in(seen, facts) + "State the start and stop of the free decay."
+    """What the drift of the zero hides: the motion, or an error of the model."""
     seen = (
         "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at its "
-        "frequency. It hides an error of the model. Where dry friction ends the motion, state an earlier stop; else "
+        "frequency. It hides an error of the model. Where dry friction ends the motion, state an earlier stop; else {smaller}."
     )
-    return filled_in(seen, facts) + f"{_smaller(facts)}."
+    if facts["larger"]:
+        seen = (
+            "{label}: the fitted drift of the zero is larger than the motion, so the motion may be part of it. State the "
+            "start and stop of the free decay."
+        )
+    return _with_smaller(seen, facts)
 
 
 def _hidden(facts: Facts) -> str:
@@ -531,12 +512,23 @@ MESSAGES = {
     "decays.position": Message(
         "position of a decay",
         ok="{labels}: the residuals do not depend on position and direction ({p:p})",
-        fail=_position,
+        fail=partial(
+            _with_smaller,
+            "{label}: the residuals must not depend on the position of the rod, but they do ({p:p}), most from {low:.4g} to "
+            "{high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the sensor, or "
+            "{smaller}.",
+        ),
     ),
     "decays.residuals": Message(
         "residuals and amplitude of a decay",
         ok="{labels}: the residuals do not grow with the amplitude ({p:p})",
-        fail=_residuals,
+        fail=partial(
+            _with_smaller,
+            "{label}: the residuals must not be larger where the motion is larger, but they are, {ratio:.1f} times ({p:p}). "
+            "What was fitted as noise is an error of the model there, such as a stiffness or a damping that depends on the "
+            "amplitude, or an error of the sensor in proportion to the motion. To find the cause, {smaller}, and compare the "
+            "results.",
+        ),
     ),
     "decays.drift": Message(
         "drift of a decay",

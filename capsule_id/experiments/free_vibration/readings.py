@@ -13,7 +13,7 @@ from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ra
 from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
-from capsule_id.rig.schema import COUNT, Entry, GroundSettings, NameRule, QuantityRule, WordsRule
+from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, QuantityRule, WordsRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE
 from capsule_id.views import Facts, Finding, Message
 
@@ -287,18 +287,6 @@ class DecaySettings(GroundSettings):
         return "slope" not in self.ground
 
 
-def check_ground(entry: Entry[DecaySettings]) -> None:
-    """Refuse a slope that the closed form does not have: of a held capsule it shifts the rest position alone."""
-    settings = entry.table.settings
-    if settings.forward == "capsule":
-        return
-    if settings.stiffness == "cubic":
-        entry.refuse_ground("slope", "a decay with a cubic spring must be on level ground")
-    if settings.capsule == "free":
-        for key in ("slope", "N0"):
-            entry.refuse_ground(key, f'the closed form of a free capsule has no {key}; forward = "capsule" has')
-
-
 @dataclass(frozen=True)
 class DecayModel:
     """Forces of a free decay besides the viscous damping and the linear spring, drift and noise of its record.
@@ -332,8 +320,13 @@ class DecayModel:
     def lines(self, *keys: str) -> str:
         """Lines of ``rig.toml`` that state these ``keys`` of the model."""
         words = ", ".join(f'"{word}"' for word in ("viscous", *self.damping))
-        values = {"damping": f"[{words}]", "stiffness": '"cubic"' if self.cubic else '"linear"'}
-        values |= {"drift": f'"{self.drift}"', "noise": f'"{self.noise}"', "thin": str(self.thin)}
+        values = {
+            "damping": f"[{words}]",
+            "stiffness": '"cubic"' if self.cubic else '"linear"',
+            "drift": f'"{self.drift}"',
+            "noise": f'"{self.noise}"',
+            "thin": str(self.thin),
+        }
         return ", ".join(f"{key} = {values[key]}" for key in keys)
 
     @property
@@ -385,18 +378,19 @@ class DecayModel:
     @property
     def additions(self) -> list[str]:
         """Effects of the model that the default lacks, in words."""
-        words = [EFFECTS[symbol] for symbol in self.symbols]
-        return words + (["drift of the zero"] if self.drift != "none" else [])
+        return [*(EFFECTS[symbol] for symbol in self.symbols), *["drift of the zero"] * (self.drift != "none")]
 
     @property
     def name(self) -> str:
         """Words for tables and legends."""
-        words = [" + ".join(("viscous", *self.damping)) + " damping"]
-        words += ["cubic spring"] if self.cubic else []
-        words += [_DRIFTS[self.drift]] if self.drift != "none" else []
-        words += [_NOISES[self.noise]] if self.noise != "white" else []
-        words += [f"means of {self.thin} samples"] if self.thin > 1 else []
-        return ", ".join(words)
+        words = (
+            " + ".join(("viscous", *self.damping)) + " damping",
+            "cubic spring" if self.cubic else "",
+            _DRIFTS.get(self.drift, ""),
+            _NOISES.get(self.noise, ""),
+            f"means of {self.thin} samples" if self.thin > 1 else "",
+        )
+        return ", ".join(filter(None, words))
 
 
 def window_of(table: Table) -> slice:
@@ -415,10 +409,8 @@ def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
 
 def stated_model(table: Table) -> DecayModel:
     """Return the model that the settings of ``table`` state; a long record is thinned where they leave that open."""
-    model = DecayModel.stated(table.settings)
-    if table.settings.thin is not None:
-        return model
-    return replace(model, thin=default_block_size(*decay_window(table)))
+    thin = table.settings.thin or default_block_size(*decay_window(table))
+    return replace(DecayModel.stated(table.settings), thin=thin)
 
 
 def first_periods(table: Table[DecaySettings]) -> Table[DecaySettings]:

@@ -119,11 +119,12 @@ def noise_parameters(model: DecayModel, time: np.ndarray, period: float, of: str
     (s) of the decay and the square of the record's length over it.
     """
     length = float(np.ptp(time))
-    between = Prior("lognormal", float(length / np.sqrt(len(time))), float(np.sqrt(len(time))))
-    slow = Prior("lognormal", 0.3 * length, max(3.0, 0.3 * length / period))
-    rows = [NOISE_TIME.named(of, between)] if model.noise != "white" else []
-    rows += [WHITE_RATIO.named(of)] if model.noise == "arma" else []
-    return rows + ([DRIFT_RATIO.named(of), DRIFT_TIME.named(of, slow)] if model.drift == "gp" else [])
+    priors = {
+        "noise_time": Prior("lognormal", float(length / np.sqrt(len(time))), float(np.sqrt(len(time)))),
+        "drift_time": Prior("lognormal", 0.3 * length, max(3.0, 0.3 * length / period)),
+    }
+    rows = {row.symbol: row for row in (NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME)}
+    return [rows[symbol].named(of, priors.get(symbol)) for symbol in model.shapes]
 
 
 def whiten(times: ReadingTimes, columns: Any, model: DecayModel, theta: ValuesBySymbol) -> Any:
@@ -244,6 +245,7 @@ class Decay(SurfaceExperiment):
 
     #: Words of the title of its panel.
     title: ClassVar[str]
+    masses = ("m1",)
 
     @abstractmethod
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
@@ -253,9 +255,9 @@ class Decay(SurfaceExperiment):
     def whitened(self, theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
         """Columns (m,) or (m, q) in the coordinates where the noise, and a drift, are white."""
 
-    @abstractmethod
     def with_model(self, model: DecayModel, screened: Screened | None = None) -> Self:
         """Return the same readings with another model; its fit ``screened`` gives the starting point."""
+        return type(self)(self.table, self.rig, self.friction, model, screened)  # type: ignore[call-arg]  # pyright: ignore
 
     @property
     @abstractmethod
@@ -272,10 +274,6 @@ class Decay(SurfaceExperiment):
     def own_symbols(self) -> tuple[str, ...]:
         """Symbols of the unknowns of the motion besides its forces."""
         return ("amplitude",)
-
-    @property
-    def masses(self) -> tuple[str, ...]:
-        return ("m1",)
 
     @property
     def mass(self) -> float:
@@ -406,9 +404,6 @@ class DecayRecord(Decay):
     def with_table(self, table: Table) -> Self:
         """Return the record of another part of its table, with the same model."""
         return self if table is self.table else type(self)(table, self.rig, self.friction, self.model)
-
-    def with_model(self, model: DecayModel, screened: Screened | None = None) -> Self:
-        return type(self)(self.table, self.rig, self.friction, model, screened)
 
     @property
     def explains_trend(self) -> bool:

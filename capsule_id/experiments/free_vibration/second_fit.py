@@ -4,19 +4,18 @@ import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
 from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import Start
 from capsule_id.experiments.checks import LEVEL, ljung_box, refit
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, equilibrium, viscous_fit
-from capsule_id.experiments.free_vibration.hidden_terms import force_responses
+from capsule_id.experiments.free_vibration.hidden_terms import force_responses, further_columns
 from capsule_id.experiments.free_vibration.models import (
     HalfCycles,
     half_cycles,
@@ -84,10 +83,11 @@ def decay_starts(e: DecayRecord) -> dict[str, Start]:
         forces |= {
             name: Start(max(rough_damping.get(name, 0.0), 0.2 * forces[name].centre), 0.2) for name in ("F_dry", "c_q")
         }
-        starts |= {symbol: forces[symbol] for symbol in e.model.symbols}
-        starts["c"] = Start(max(rough_damping.get("c", rough.c), 0.1 * rough.c), 0.2)
-        starts[f"amplitude[{e.label}]"] = Start(size, 0.05)
-        starts[f"turning_time[{e.label}]"] = Start(time, 0.05 / rough.Omega_o)
+        starts |= {symbol: forces[symbol] for symbol in e.model.symbols} | {
+            "c": Start(max(rough_damping.get("c", rough.c), 0.1 * rough.c), 0.2),
+            f"amplitude[{e.label}]": Start(size, 0.05),
+            f"turning_time[{e.label}]": Start(time, 0.05 / rough.Omega_o),
+        }
     known = {} if e.about.screened is None else e.about.screened.values
     for row in e.parameters:
         if row.symbol in known:
@@ -189,6 +189,8 @@ def _whitened(times: ReadingTimes, raw: Any, thetas: Mapping[str, Any], sloped: 
     """(batch, n) whitened residuals at the best offset and, where ``sloped`` is 1, the best slope."""
     time = times.time
     slope = sloped * (time - jnp.mean(time)) / (time[-1] - time[0])
+    # A drift counts in units of the noise, which is white where the ratio is beyond its bounds.
+    drift = thetas["drift_ratio"] * jnp.where(thetas["white_ratio"] > np.exp(BOUNDS["white_ratio"][1]), WHITE, 1.0)
 
     def one(raw: Any, shape: Mapping[str, Any]) -> Any:
         white = whiten_by_shape(times, jnp.stack([raw, jnp.ones_like(raw), slope], axis=1), "arma", shape)
@@ -198,9 +200,8 @@ def _whitened(times: ReadingTimes, raw: Any, thetas: Mapping[str, Any], sloped: 
         offset = jnp.stack([d * moment[0] - b * moment[1], a * moment[1] - b * moment[0]]) / (a * d - b**2)
         return own - design @ offset
 
-    return jax.vmap(one)(
-        raw, {name: thetas[name] for name in ("noise_time", "white_ratio", "drift_ratio", "drift_time")}
-    )
+    shapes = {name: thetas[name] for name in ("noise_time", "white_ratio", "drift_time")}
+    return jax.vmap(one)(raw, {**shapes, "drift_ratio": drift})
 
 
 class Screening:
@@ -238,20 +239,14 @@ class Screening:
         own = dict(zip(NAMES, np.moveaxis(z, -1, 0), strict=True))
         values = {name: self.units[name] * (x if name in LINEAR else np.exp(x)) for name, x in own.items()}
         values["turning_time"] = self.turning_time + values["turning_time"]
-        # A drift counts in units of the noise, which is white where the ratio is beyond its bounds.
-        values["drift_ratio"] *= np.where(own["white_ratio"] > BOUNDS["white_ratio"][1], WHITE, 1.0)
         for name in ("white_ratio", "drift_ratio"):
             values[name] = np.where(own[name] < BOUNDS[name][0], 0.0, values[name])
         return {"m1": np.broadcast_to(self.m1, values["k1"].shape), **values}
 
     def scaled(self, values: Mapping[str, float]) -> np.ndarray:
         """(names,) scaled unknowns at values by symbol, SI, of another fit; amplitude and time of this record's own."""
-        z = np.zeros(len(NAMES))
-        for i, name in enumerate(NAMES):
-            value = values.get(name, 0.0) / self.units[name]
-            if name not in OWN and (name in LINEAR or value > 0.0):
-                z[i] = value if name in LINEAR else np.log(value)
-        return z
+        known = {name: 0.0 if name in OWN else values.get(name, 0.0) / self.units[name] for name in NAMES}
+        return np.array([x if name in LINEAR or x <= 0.0 else np.log(x) for name, x in known.items()])
 
     def start(self, model: DecayModel, near: np.ndarray | None, absent: bool = False) -> np.ndarray:
         """(names,) scaled starting values; terms that the model lacks are switched off, ``absent`` those ``near`` lacks too."""
@@ -281,9 +276,8 @@ class Screening:
         i, j = NAMES.index("F_dry"), NAMES.index("c")
         found = self.theta(start)
         known = "F_dry" in self.rough_damping(("F_dry",))
-        grid = found["F_dry"] * np.geomspace(0.5, 2.0, len(NAMES) + 1)
-        if not known:
-            grid = self.units["F_dry"] * np.geomspace(0.003, 0.45, len(NAMES) + 1)
+        size, low, high = (found["F_dry"], 0.5, 2.0) if known else (self.units["F_dry"], 0.003, 0.45)
+        grid = size * np.geomspace(low, high, len(NAMES) + 1)
         lost = (found["F_dry"] if known else 0.0) - grid
         c = np.maximum(found["c"] + lost * 4.0 / (np.pi * self.omega * self.mean_peak), 0.02 * self.c)
         starts = np.tile(start, (len(grid), 1))
@@ -291,11 +285,8 @@ class Screening:
         moved = np.repeat(starts[None], DRY_ROUNDS, axis=0)
         rng = np.random.default_rng(0)
         for name, spread in DRY_SPREADS.items():
-            z = spread * rng.standard_normal(moved.shape[:2])
-            place = NAMES.index(name)
-            moved[1:, :, place] = (
-                (moved[1:, :, place] * np.exp(z[1:])) if name == "F_dry" else moved[1:, :, place] + z[1:]
-            )
+            z, place = spread * rng.standard_normal(moved.shape[:2])[1:], NAMES.index(name)
+            moved[1:, :, place] = moved[1:, :, place] * np.exp(z) if name == "F_dry" else moved[1:, :, place] + z
         return moved.reshape(-1, len(NAMES))
 
     def fit(
@@ -391,14 +382,8 @@ class Screening:
         scaled = found.jac / norms
         variances = np.maximum(np.diag(np.linalg.pinv(scaled.T @ scaled, hermitian=True)), UNKNOWN) / norms**2
         sd = np.sqrt(variances * 2.0 * found.cost / max(n - unknowns, 1))
-        moved = {name: self.theta(z + STEP * np.eye(len(NAMES))[NAMES.index(name)]) for name in free}
-        errors = {
-            name: float(abs(moved[name][name] - values[name]) / STEP * own) for name, own in zip(moved, sd, strict=True)
-        }
-        if model.noise == "white":
-            for each in (values, errors):
-                if "drift_ratio" in each:
-                    each["drift_ratio"] /= WHITE
+        units = {name: self.units[name] if name in LINEAR else values[name] for name in free}
+        errors = {name: float(units[name] * own) for name, own in zip(free, sd, strict=True)}
         noise = float(np.sqrt(2.0 * found.cost / n)) * unit
         return Screened(float(deviance + unknowns * np.log(n)), values, errors, noise, found.fun, nested)
 
@@ -471,16 +456,10 @@ def response_p(record: DecayRecord, theta: Mapping[str, float]) -> float:
     extra = np.column_stack([*columns, relative, relative**2])
     moved = [record.unwhitened({**theta, name: 1.001 * theta[name]}, np)[1] @ parts for name in ("k1", "c")]
     known = np.column_stack([design, *(column - design @ parts for column in moved)])
-    both = np.concatenate([known, extra], axis=1)
-    freedom = record.n - both.shape[1]
-    if freedom < 1:
-        return 1.0
-    own, further = (
-        # A column of zeros is no effect: quadratic damping of a record that stays where it is.
-        float(np.sum((raw - a @ np.linalg.lstsq(a, raw, rcond=None)[0]) ** 2))
-        for a in (x / np.maximum(np.linalg.norm(x, axis=0), np.finfo(float).tiny) for x in (known, both))
-    )
-    return float(stats.f.sf((own - further) / extra.shape[1] * freedom / further, extra.shape[1], freedom))
+    # A column of zeros is no effect: quadratic damping of a record that stays where it is.
+    extra = extra / np.maximum(np.linalg.norm(extra, axis=0), np.finfo(float).tiny)
+    p, _ = further_columns(known, extra, raw)
+    return 1.0 if p is None else p
 
 
 def thinning(record: DecayRecord, per_period: float) -> int:
@@ -582,12 +561,8 @@ def _with_noise(
     return replace(chosen, model=replace(chosen.model, thin=thin))
 
 
-class Demanded(NamedTuple):
-    """What some decays demand: labels of those that contradict their model, all of them under the new one, and facts."""
-
-    contradicting: Sequence[str]
-    decays: Sequence[Any]
-    facts: Facts
+#: What some decays demand: labels of those that contradict their model, all of them under the new one, and facts.
+Demanded = tuple[Sequence[str], Sequence[Any], Facts]
 
 
 def replaced(
@@ -678,7 +653,7 @@ def _demanded(records: list[DecayRecord], level: float) -> Demanded:
     """What ``records`` demand: they share the model with the lowest BIC where one of them contradicts the stated one."""
     contradicting = [e.label for e in records if e.n >= SHORTEST and demands_another(e, level)]
     if not contradicting:
-        return Demanded((), records, {})
+        return (), records, {}
     own = [e.with_table(first_periods(e.table)) for e in records]
     ranking = demanded_model(own)
     text = _drift_text(own, ranking)
@@ -686,15 +661,13 @@ def _demanded(records: list[DecayRecord], level: float) -> Demanded:
         text += f" The second fit uses the first {MOST_PERIODS} periods of each record."
     kept = own if ranking.model.slow else records
     others = [e.with_model(ranking.model, fit) for e, (fit, _) in zip(kept, ranking.fits, strict=True)]
-    return Demanded(contradicting, others, {"drift": text})
+    return contradicting, others, {"drift": text}
 
 
 def _drift_text(records: Sequence[DecayRecord], ranking: Ranking) -> str:
     """A sentence on the size of the drift in every record; "" without a drift."""
     if ranking.model.drift == "none":
         return ""
-    sizes = []
-    for record, (_, z) in zip(records, ranking.fits, strict=True):
-        size = Screening(record, ranking.model.thin).drift(z) * record.column.to_display
-        sizes.append(f"{size:.2g} {record.column.unit} in {record.label}")
+    fitted = [(e, Screening(e, ranking.model.thin), z) for e, (_, z) in zip(records, ranking.fits, strict=True)]
+    sizes = (f"{s.drift(z) * e.column.to_display:.2g} {e.column.unit} in {e.label}" for e, s, z in fitted)
     return f" The zero drifts by {', '.join(sizes)}."

@@ -1,9 +1,8 @@
 """Turning points of a free decay, read one by one: times and positions (``samples = "turning_points"``)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,9 +12,9 @@ from scipy import stats
 
 from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, stated_rate, stretch
 from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.free_vibration.checks import each, halves
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
+from capsule_id.experiments.free_vibration.experiment import each, halves
 from capsule_id.experiments.free_vibration.hidden_terms import (
     check_hidden_terms,
     further_sensitivities,
@@ -48,48 +47,31 @@ PASSES = 4
 STEPS, BISECTIONS, CONVERGED = 30, 10, 1e-3
 
 
-@dataclass(frozen=True)
-class FurtherForce:
-    """Effect of a force that the fitted model lacks.
-
-    Attributes
-    ----------
-    model : the fitted model with this force
-    value : estimate of the parameter ``symbol``, SI
-    z : that over its sd, as of a normal variable; 0 for friction that pushes
-    moved : whether another parameter changes by more than the sd that the fitted model gives it, that of the mass included
-    """
-
-    model: DecayModel
-    symbol: str
-    value: float
-    z: float
-    moved: bool
-
-
-def further_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset: bool = False) -> FurtherForce | None:
+def further_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset: bool = False) -> Facts | None:
     """Estimate the force with this parameter beside those of the fit ``theta``, about which the model is linearised.
-
-    None for a table that is too short.
 
     Parameters
     ----------
     offset : whether amplitudes of one side may be counted from another place than the rest position
+
+    Returns
+    -------
+    ``name`` of its parameter, its estimate ``value``, SI, and its ``unit``. ``z``: the estimate over its sd, as of a normal
+    variable; 0 for friction that pushes. ``moved``: whether another parameter changes by more than the sd that the fitted
+    model gives it, that of the mass included. None for a table that is too short.
     """
     columns, left, symbols = linear(e, theta)
     if offset and not e.both_sides:
         columns = np.column_stack([columns, np.repeat([1.0, 0.0], len(e.values))])
     if len(e.values) < FEWEST_TURNS or len(e.values) <= columns.shape[1] + 1:
         return None
-    model = e.model.with_force(symbol)
     _, own, _ = least_squares(columns, -left, len(e.values))
     both = np.column_stack([columns, further_sensitivities(e, theta)[symbol]])
     found, sd, freedom = least_squares(both, -left, len(e.values))
-    if found[-1] <= 0.0 and symbol != "k_cubic":
-        return FurtherForce(model, symbol, 0.0, 0.0, False)
-    mass = relative_sd_of_mass(e)
+    pushes, mass = found[-1] <= 0.0 and symbol != "k_cubic", relative_sd_of_mass(e)
     moved = any(abs(found[k]) > np.hypot(own[k], mass * theta[name]) for k, name in enumerate(symbols))
-    return FurtherForce(model, symbol, float(found[-1]), as_normal(found[-1] / sd[-1], freedom), moved)
+    value, z = (0.0, 0.0) if pushes else (float(found[-1]), as_normal(found[-1] / sd[-1], freedom))
+    return {"name": symbol, "value": value, "unit": parameter(symbol).unit, "z": z, "moved": moved and not pushes}
 
 
 def linear(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Float[np.ndarray, "m p"], np.ndarray, tuple[str, ...]]:
@@ -209,23 +191,25 @@ def _cost(e: "TurningPoints", theta: ValuesBySymbol) -> float:
 
 def check_steps(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding]:
     """Warn where the readings are more regular than their digits show, so that the rounding error is all that is known."""
-    findings = []
-    for e in tables:
-        theta = e.local(fit.values)
-        # The positions tell the damping, the times the stiffness.
-        for name, symbol, told, step in zip(("x_rel", "time"), e.scatters, ("c", "k1"), e.steps, strict=True):
-            if theta[symbol] >= step / np.sqrt(12.0):
-                continue
-            column = e.table.columns[name]
-            facts = {
+    # The positions tell the damping, the times the stiffness.
+    return [
+        Finding(
+            "decays.step",
+            "warn",
+            {
                 "label": e.label,
                 "column": name,
-                "unit": column.unit,
-                "step": step * column.to_display,
+                "unit": e.table.columns[name].unit,
+                "step": step * e.table.columns[name].to_display,
                 "name": told,
-            }
-            findings.append(Finding("decays.step", "warn", facts, e.label, (told,)))
-    return findings
+            },
+            e.label,
+            (told,),
+        )
+        for e in tables
+        for name, symbol, told, step in zip(("x_rel", "time"), e.scatters, ("c", "k1"), e.steps, strict=True)
+        if e.local(fit.values)[symbol] < step / np.sqrt(12.0)
+    ]
 
 
 def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
@@ -233,11 +217,11 @@ def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Level] | N
     found = [one for symbol in e.model.absent if (one := further_force(e, theta, symbol))]
     if not found:
         return None
-    best = max(found, key=lambda one: one.z)
-    facts = {"name": best.symbol, "value": best.value, "unit": parameter(best.symbol).unit, "z": best.z}
-    key = "stiffness" if best.symbol == "k_cubic" else "damping"
-    facts |= {"line": best.model.lines(key), "model": e.model.name, "one_side": not e.both_sides}
-    return facts, "ok" if best.z <= DISAGREE else "fail" if best.z > FAIL and best.moved else "warn"
+    best = max(found, key=lambda one: one["z"])
+    key = "stiffness" if best["name"] == "k_cubic" else "damping"
+    line = e.model.with_force(best["name"]).lines(key)
+    facts = {**best, "line": line, "model": e.model.name, "one_side": not e.both_sides}
+    return facts, "ok" if best["z"] <= DISAGREE else "fail" if best["z"] > FAIL and best["moved"] else "warn"
 
 
 check_forces, check_halves = each("decays.forces", forces), halves(changes_of_second_half)
@@ -257,37 +241,39 @@ def demanded(tables: "Sequence[TurningPoints]") -> Demanded:
     """Return ``tables`` with the forces that they demand, one after the other."""
     labels, own = list[str](), list(tables)
     while found := _demanded_force(own):
-        label, force = found
+        label, symbol, _ = found
         labels.append(label)
-        own = [e.with_model(force.model) for e in own]
+        own = [e.with_model(e.model.with_force(symbol)) for e in own]
     chosen = [e.with_model(e.model, screened(e, e.model)) for e in own] if labels else own
-    return Demanded(labels, chosen, {"labels": [e.label for e in own]})
+    return labels, chosen, {"labels": [e.label for e in own]}
 
 
-def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, FurtherForce] | None:
-    """The most significant force that a table demands, with the label of that table."""
+def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, str, float] | None:
+    """The label of a table that demands a force, and its parameter and its z: the most significant one."""
     found = []
     for e in tables:
         symbols, cubic = open_forces(e), e.table.settings.offers_cubic
         theta = fitted(e) if symbols else {}
-        forces = [one for symbol in symbols if (one := further_force(e, theta, symbol))]
-        offered = [one for one in forces if one.z > FAIL and (cubic or one.symbol != "k_cubic")]
-        if not offered:
-            continue
-        best = max(offered, key=lambda one: one.z)
-        rivals = [one for one in forces if one is not best and one.z > RIVAL]
-        beside_offset = further_force(e, theta, best.symbol, offset=True)
-        if beside_offset and beside_offset.z > DISAGREE and all(_excluded(e, one, best.symbol) for one in rivals):
-            found.append((e.label, best))
-    return max(found, key=lambda pair: pair[1].z) if found else None
+        z = {symbol: one["z"] for symbol in symbols if (one := further_force(e, theta, symbol))}
+        offered = [symbol for symbol in z if z[symbol] > FAIL and (cubic or symbol != "k_cubic")]
+        best = max(offered, key=lambda symbol: z[symbol], default="")
+        rivals = (symbol for symbol in z if symbol != best and z[symbol] > RIVAL)
+        # It is demanded beside an offset, and beside every other force.
+        if best and _demands(e, theta, best, offset=True) and all(_demands_beside(e, one, best) for one in rivals):
+            found.append((e.label, best, z[best]))
+    return max(found, key=lambda one: one[2], default=None)
 
 
-def _excluded(e: "TurningPoints", other: FurtherForce, symbol: str) -> bool:
+def _demands(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset: bool = False) -> bool:
+    """Whether the readings demand the force with the parameter ``symbol`` at the fit ``theta``."""
+    force = further_force(e, theta, symbol, offset)
+    return force is not None and force["z"] > DISAGREE
+
+
+def _demands_beside(e: "TurningPoints", other: str, symbol: str) -> bool:
     """Whether the readings demand the force with the parameter ``symbol`` even beside the force ``other``."""
-    with_other = e.with_model(other.model)
-    theta: ValuesBySymbol = fitted(with_other)
-    force = further_force(with_other, theta, symbol)
-    return force is not None and force.z > DISAGREE
+    with_other = e.with_model(e.model.with_force(other))
+    return _demands(with_other, fitted(with_other), symbol)
 
 
 # experiment: Turning points of a free decay, read one by one: times and positions (``samples = "turning_points"``).
@@ -315,6 +301,7 @@ class TurningPoints(Decay):
     both_sides: bool = eqx.field(static=True)
 
     title = "turning points of a free decay"
+    scatters: ClassVar[tuple[str, str]] = ("noise_sd", "time_sd")
     checks = (check_steps, check_forces, check_halves, check_hidden_terms)
 
     def __init__(
@@ -359,9 +346,6 @@ class TurningPoints(Decay):
         ]
         self.about = DecayAbout(table, rig, tuple(rows), screened, rough)
 
-    def with_model(self, model: DecayModel, screened: Screened | None = None) -> Self:
-        return type(self)(self.table, self.rig, self.friction, model, screened)
-
     @property
     def lines(self) -> str:
         return self.model.lines("damping", "stiffness")
@@ -386,10 +370,6 @@ class TurningPoints(Decay):
         return float(np.max(np.abs(self.values)))
 
     @property
-    def scatters(self) -> tuple[str, str]:
-        return ("noise_sd", "time_sd")
-
-    @property
     def observed(self) -> np.ndarray:
         return np.concatenate([self.values, self.time])
 
@@ -409,12 +389,8 @@ class TurningPoints(Decay):
     def paper_decrement(self, smooth: bool = True) -> Decrement:
         """Observed frequency and logarithmic decrement of the turning points; ``smooth`` has no effect."""
         del smooth
-        index = self.index
         peaks = self.values - (0.5 * (self.values[-1] + self.values[-2]) if self.both_sides else 0.0)
-        used = np.abs(peaks) > 0.05 * np.max(np.abs(peaks))
-        Omega_o = float(np.pi / np.polyfit(index, self.time, 1)[0])
-        delta = float(-2.0 * np.polyfit(index[used], np.log(np.abs(peaks[used])), 1)[0])
-        return Decrement.of(self.time, peaks, Omega_o, delta, self.mass)
+        return Decrement.of(self.index, self.time, peaks, self.mass, smallest=0.05)
 
     def starts(self) -> dict[str, Start]:
         size, c = abs(float(self.rough.peaks[0])), max(self.rough.c, 1e-4 * self.rough.k1 / self.rough.Omega_o)
