@@ -13,7 +13,9 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.joint_fit import joint_fit
-from capsule_id.inference.leave_out import (
+from capsule_id.inference.marginal import trials_of
+from capsule_id.inference.pipeline import check_readings, second_models
+from capsule_id.inference.prediction import (
     LARGEST_SHAPE,
     LeftOut,
     WeightedDraws,
@@ -24,8 +26,6 @@ from capsule_id.inference.leave_out import (
     predictions_text,
     weighted_draws,
 )
-from capsule_id.inference.marginal import trials_of
-from capsule_id.inference.pipeline import check_readings, second_models
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
 from capsule_id.views import counted
@@ -110,7 +110,7 @@ class Choice:
     recommended : the variant with the fewest parameters within ``STANDARD_ERRORS`` of the best, of point fits within
         ``STRONG``
     line : the recommendation in words, with the lines of ``[model]``, and what is uncertain
-    predictions : of the recommended variant, see ``capsule_id.inference.leave_out.left_out_predictions``; None for point
+    predictions : of the recommended variant, see ``capsule_id.inference.prediction.left_out_predictions``; None for point
         fits
     """
 

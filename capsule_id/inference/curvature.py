@@ -1,7 +1,6 @@
 """Curvature at the maximum: covariance from a Jacobian, gradient and Hessian by central differences."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -18,45 +17,22 @@ Jacobian = Float[np.ndarray, "n d"]
 Residuals = Float[np.ndarray, " n"]
 
 
-@dataclass(frozen=True)
-class Covariance:
-    """Covariance of the parameters at a minimum, and the rank of their Jacobian.
+def covariance(jacobian: Jacobian) -> Float[np.ndarray, "d d"]:
+    """(JᵀJ)⁻¹ of standardised residuals from the singular values of J (n, d), units of the parameters.
 
-    Attributes
-    ----------
-    matrix : (d, d), units of the parameters; every entry is inf where the Jacobian is rank deficient
-    rank : numerical rank of the Jacobian, its columns scaled to unit length; 0 where it is not finite
-    """
-
-    matrix: np.ndarray
-    rank: int
-
-    @property
-    def rank_deficient(self) -> bool:
-        """Whether some combination of the parameters leaves the residuals unchanged: no standard error exists."""
-        return self.rank < self.matrix.shape[0]
-
-    @property
-    def standard_errors(self) -> np.ndarray:
-        """(d,) square roots of the diagonal, units of the parameters; inf where rank deficient."""
-        return np.sqrt(np.diag(self.matrix))
-
-
-def covariance(jacobian: Jacobian) -> Covariance:
-    """(JᵀJ)⁻¹ of standardised residuals from the singular values of J (n, d), infinite where J is rank deficient.
-
-    A pseudo-inverse would give a direction without data zero variance.
+    Every entry is inf where J is not finite, or where some combination of the parameters leaves the residuals unchanged:
+    no standard error exists, and a pseudo-inverse would give a direction without data zero variance.
 
     The columns are scaled to unit length first, so that the rank does not depend on the units of the parameters.
     """
     no_answer = np.full((jacobian.shape[1], jacobian.shape[1]), np.inf)
     if not np.isfinite(jacobian).all():
-        return Covariance(no_answer, 0)
+        return no_answer
     _, singular, right, column_norm = column_space(jacobian)
     if len(singular) < jacobian.shape[1]:
-        return Covariance(no_answer, len(singular))
+        return no_answer
     root = right.T / singular / column_norm[:, None]
-    return Covariance(root @ root.T, len(singular))
+    return root @ root.T
 
 
 def all_finite(jacobian: Jacobian, residuals: Residuals) -> bool:

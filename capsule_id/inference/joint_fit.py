@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
@@ -19,7 +18,7 @@ from capsule_id.inference.least_squares import LeastSquaresFit, Solver, least_sq
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.point_fit import AGREEMENT, described, dispersed_starts
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.views import counted
 
 # joint starts: Starting points of the joint fit: the bench estimates and the best of many candidates around them.
@@ -172,7 +171,7 @@ def joint_fit(
         raise _not_finite(target, ends[best].fit, len(starts))
     fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
-    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0]).matrix
+    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0])
     scatters = np.flatnonzero(target.scatter)
     matrix[scatters, scatters] = _scatter_variances(target, u[best])
     return described(
@@ -239,7 +238,7 @@ def _compile_descent(target: LogPosterior) -> None:
     if any(e.has_joint_scatters for e in target.experiments):
         in_batches(partial(difference_descent.rows_of, target), u, difference_descent.ROWS)
     else:
-        linearised(HeldResiduals(target, jnp.asarray(u[0])), u[0, target.located])
+        linearised(target, u[0], u[0, target.located])
 
 
 def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
@@ -305,7 +304,7 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
         if kinked:
             fit = difference_descent.descend(target, u)
         else:
-            fit = least_squares(HeldResiduals(target, jnp.asarray(u)), u[located][None], SOLVER)
+            fit = least_squares(partial(linearised, target, u), u[located][None], SOLVER)
         if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):
             return _End(u, fit, False, -np.inf)
         sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))

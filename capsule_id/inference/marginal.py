@@ -184,6 +184,10 @@ FARTHEST_WITH_KINKS = 20.0
 EMULATED_NODES, EMULATED_ERROR, PLACES = (16, 32, 64, 128), 0.02, 512
 
 
+#: Rows that are evaluated together where each takes more than this work, in readings: more would leave the caches.
+ROWS_TOGETHER, HEAVY = 8, 30_000
+
+
 @dataclass(frozen=True)
 class Layout:
     """Static structure of the integrated log-posterior.
@@ -260,10 +264,6 @@ class MarginalPosterior:
         values = in_batches(one, v)
         # Scatters without located parameters in their block add a constant.
         return np.where(np.isfinite(values), values, -np.inf)[:, : len(self.blocks)]
-
-    def batch(self, v: np.ndarray) -> np.ndarray:
-        """(w,) log-posterior of the located u (w, dimension), up to the evidence; -inf where it is not finite."""
-        return np.sum(self.parts(v), axis=1)
 
     def theta(self, u: np.ndarray) -> np.ndarray:
         """(..., d) constrained values from the whole u (..., d)."""
@@ -441,7 +441,10 @@ def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: 
     Logarithms of: terms without scatters (w, blocks); densities of t at the nodes (w, scatters, nodes), see
     ``capsule_id.inference.marginal``; their integrals (w, scatters).
     """
-    return target.by_rows(partial(_conditional, layout, target, bend), v, start, step)
+    of_row = partial(_conditional, layout, target, bend)
+    if target.work < HEAVY:
+        return jax.vmap(of_row)(v, start, step)
+    return jax.lax.map(lambda row: of_row(*row), (v, start, step), batch_size=ROWS_TOGETHER)
 
 
 def _conditional(

@@ -33,8 +33,7 @@ from capsule_id.experiments.kind import Registry
 from capsule_id.experiments.lint import lint
 from capsule_id.inference.checks.posterior import check_agreement, decisive_readings
 from capsule_id.inference.checks.settings import SampledFit
-from capsule_id.inference.checks.verdict import run_checks, with_scaled
-from capsule_id.inference.checks.widening import beside_stated, record_widenings, widenings
+from capsule_id.inference.checks.verdict import beside_stated, record_widenings, run_checks, widenings, with_scaled
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.point_stage import PointStage

@@ -4,9 +4,9 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 from scipy.linalg import solve_triangular
@@ -22,10 +22,10 @@ from capsule_id.inference.curvature import (
     jacobian,
     value_and_gradient,
 )
-from capsule_id.inference.least_squares import Solver, least_squares
+from capsule_id.inference.least_squares import Solver, least_squares, linearised
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.result import STATED, PointFit
-from capsule_id.inference.target import HeldResiduals, LogPosterior, prior_of
+from capsule_id.inference.target import LogPosterior, prior_of
 from capsule_id.parameters import is_stated
 
 # variance shares: Uncertainty budget of a point fit: how much every table and every prior contributes to the sd of a
@@ -52,9 +52,9 @@ def variance_shares(
     By parameter, then by input: the label of a table, ``prior of c``, ``stated value of m1``.
     """
     found = covariance(jacobian)
-    if found.rank_deficient:
+    if not np.isfinite(found).all():
         return {}
-    effect = (jacobian @ found.matrix) ** 2 / np.diag(found.matrix)
+    effect = (jacobian @ found) ** 2 / np.diag(found)
     inputs = [e.table.label for e in owners if e is not None]
     stated = [is_stated(row.name) or prior_of(row).kind == "positive_normal" for row in target.parameters]
     inputs += [f"{STATED if own else 'prior of '}{name}" for name, own in zip(target.names, stated, strict=True)]
@@ -142,7 +142,7 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:
         compiled = pool.submit(density, np.repeat(starts[:1], BATCH, axis=0))
-        rough = least_squares(HeldResiduals(target, jnp.asarray(starts[0])), starts[:, located], BASIN_SOLVER)
+        rough = least_squares(partial(linearised, target, starts[0], heavy=False), starts[:, located], BASIN_SOLVER)
         compiled.result()
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
@@ -245,8 +245,7 @@ def described(
     The error of a parameter sampled through its logarithm is its relative error times its value; NaN for scatters.
     """
     theta, located, errors = target.theta(u), target.located, np.full(target.dimension, np.nan)
-    matrix = covariance(at_fit)
-    errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    errors[located] = np.sqrt(np.diag(covariance(at_fit))) * np.where(target.positive, theta, 1.0)[located]
     return PointFit(
         names=target.names,
         u=u,

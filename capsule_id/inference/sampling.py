@@ -9,35 +9,39 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple
 
 import numpy as np
 from emcee import State
 
 from capsule_id.console import OnProgress
-from capsule_id.inference.ensemble import ChainStore, Ensemble, OpenBackend, initial_state
+from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.moves import (
+    ChainStore,
+    Ensemble,
     Moves,
+    OpenBackend,
     block_move,
     bulk_and_tail_size,
     delayed_moves,
     effective_sample_size,
     ensemble_time,
+    initial_state,
     integrated_time,
     pooled_time,
     split_rhat,
 )
-from capsule_id.inference.proposal import BlockProposal, block_proposal
-from capsule_id.inference.refinement import (
+from capsule_id.inference.proposal import (
     LARGEST_MAP,
     NO_MASS,
+    BlockProposal,
     Transported,
     affordable_rounds,
+    block_proposal,
     effective_size,
     refined,
 )
 from capsule_id.inference.result import Posterior
-from capsule_id.inference.target import Scale
 
 # emulation: Emulation of a posterior whose motions take long: exact motions near the posterior, and emulators fitted
 # to them.
@@ -66,19 +70,6 @@ FAR = 15.0
 AGAIN, MAPS = 3, 2
 
 
-class Emulable(Protocol):
-    """A density whose motions can be emulated; see ``capsule_id.inference.marginal.MarginalPosterior``."""
-
-    normal_priors: np.ndarray
-    scaled: list[Scale]
-
-    def parts(self, v: np.ndarray) -> np.ndarray: ...
-
-    def motions(self, v: np.ndarray) -> list[np.ndarray]: ...
-
-    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Self: ...
-
-
 class Places(NamedTuple):
     """Draws v (n, d) of a chain, from which walkers begin."""
 
@@ -95,7 +86,7 @@ class ExactMotions(NamedTuple):
     v: np.ndarray
     motions: list[np.ndarray]
 
-    def more(self, target: Emulable, v: np.ndarray) -> "ExactMotions":
+    def more(self, target: MarginalPosterior, v: np.ndarray) -> "ExactMotions":
         """With the motions at further v (w, d)."""
         pairs = zip(self.motions, target.motions(v), strict=True)
         return ExactMotions(np.concatenate([self.v, v]), [np.concatenate(pair) for pair in pairs])
@@ -104,7 +95,7 @@ class ExactMotions(NamedTuple):
 class Emulation(NamedTuple):
     """An emulated posterior, the motions that it knows, the proposal that is adapted to it, and draws of it."""
 
-    target: Emulable
+    target: MarginalPosterior
     known: ExactMotions
     proposal: BlockProposal
     start: Places
@@ -119,7 +110,7 @@ class Emulation(NamedTuple):
 
 
 def emulation(
-    target: Emulable,
+    target: MarginalPosterior,
     first: BlockProposal,
     large: list[bool],
     random: np.random.RandomState,
@@ -159,7 +150,7 @@ def emulation(
 
 
 def corrected(
-    target: Emulable, before: Emulation, walkers: np.ndarray, large: list[bool], random: np.random.RandomState
+    target: MarginalPosterior, before: Emulation, walkers: np.ndarray, large: list[bool], random: np.random.RandomState
 ) -> Emulation:
     """Emulate ``target`` with further exact motions about ``walkers`` (w, d) of delayed acceptance by ``before``.
 
@@ -170,7 +161,7 @@ def corrected(
 
 
 def _adapted(
-    target: Emulable,
+    target: MarginalPosterior,
     known: ExactMotions,
     proposal: BlockProposal,
     v: np.ndarray,
@@ -183,7 +174,7 @@ def _adapted(
     return Emulation(emulated, known, proposal, Places(drawn))
 
 
-def _first_motions(target: Emulable, first: BlockProposal, random: np.random.RandomState) -> ExactMotions:
+def _first_motions(target: MarginalPosterior, first: BlockProposal, random: np.random.RandomState) -> ExactMotions:
     v = first.draw(random, FIRST_DRAWS)
     v = v[np.all(np.isfinite(v), axis=1)]
     motions = target.motions(v)
@@ -192,14 +183,14 @@ def _first_motions(target: Emulable, first: BlockProposal, random: np.random.Ran
     return ExactMotions(v, motions)
 
 
-def _draws(target: Emulable, proposal: BlockProposal, random: np.random.RandomState) -> np.ndarray:
+def _draws(target: MarginalPosterior, proposal: BlockProposal, random: np.random.RandomState) -> np.ndarray:
     """``DRAWS`` draws of ``target``: the last places of as many walkers that begin with draws of ``proposal``."""
     v = proposal.draw(random, 2 * DRAWS)
     v = _inside(target, v[np.all(np.isfinite(v), axis=1)])[:DRAWS]
     return _chain(target, v, block_move(proposal), random).run(STEPS, store=False).state.coords
 
 
-def _inside(target: Emulable, v: np.ndarray) -> np.ndarray:
+def _inside(target: MarginalPosterior, v: np.ndarray) -> np.ndarray:
     """Those of v (w, d) where the density of ``target`` is not 0, enough for the walkers of a chain."""
     v = v[np.all(np.isfinite(target.parts(v)), axis=1)]
     if len(v) < 2 * v.shape[1]:
@@ -207,7 +198,7 @@ def _inside(target: Emulable, v: np.ndarray) -> np.ndarray:
     return v
 
 
-def _chain(target: Emulable, v: np.ndarray, moves: Moves, random: np.random.RandomState) -> Ensemble:
+def _chain(target: MarginalPosterior, v: np.ndarray, moves: Moves, random: np.random.RandomState) -> Ensemble:
     """Walkers at v (w, d). Each chain gets random numbers of its own: chains with the same ones come together."""
     own = np.random.RandomState(random.randint(2**32, dtype=np.uint64))
     return Ensemble(target.parts, initial_state(v, own), moves)
@@ -219,7 +210,7 @@ def _around(v: np.ndarray, random: np.random.RandomState) -> np.ndarray:
 
 
 def _last_places(
-    emulated: Emulable, proposal: BlockProposal, walkers: np.ndarray, random: np.random.RandomState
+    emulated: MarginalPosterior, proposal: BlockProposal, walkers: np.ndarray, random: np.random.RandomState
 ) -> np.ndarray:
     """Places about ``walkers`` (w, d) of delayed acceptance, and draws of the wide proposal."""
     wide = proposal.draw(random, 2 * DRAWS)
@@ -230,7 +221,7 @@ def _last_places(
 
 
 def _follow(
-    target: Emulable, proposal: BlockProposal, v: np.ndarray, large: list[bool], random: np.random.RandomState
+    target: MarginalPosterior, proposal: BlockProposal, v: np.ndarray, large: list[bool], random: np.random.RandomState
 ) -> tuple[BlockProposal, np.ndarray]:
     """Proposal with maps of the large blocks that follow a chain of ``target`` from draws v (w, d), and its last places.
 
@@ -323,46 +314,8 @@ class Schedule:
         return int(np.ceil(BURN_IN_IN_TAU * self.tau))
 
 
-class Target(Protocol):
-    """A density to sample; see ``capsule_id.inference.marginal.MarginalPosterior``."""
-
-    names: tuple[str, ...]
-    dimension: int
-    blocks: list[np.ndarray]
-    centre: np.ndarray
-    covariance: np.ndarray
-    normal_priors: np.ndarray
-    scaled: list[Scale]
-    event_driven: list[bool]
-
-    @property
-    def work(self) -> int:
-        """Time of an evaluation, see ``MarginalPosterior``."""
-        ...
-
-    @property
-    def can_be_emulated(self) -> bool: ...
-
-    @property
-    def fingerprint(self) -> str:
-        """Equal for equal densities: saved draws of another density are not resumed."""
-        ...
-
-    def parts(self, v: np.ndarray) -> np.ndarray: ...
-
-    def motions(self, v: np.ndarray) -> list[np.ndarray]: ...
-
-    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Self: ...
-
-    def factors(self, v: np.ndarray) -> np.ndarray: ...
-
-    def whole(self, located: np.ndarray, factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
-
-    def theta(self, u: np.ndarray) -> np.ndarray: ...
-
-
 def sample(
-    target: Target,
+    target: MarginalPosterior,
     seed: int,
     budget: int = DEFAULT_BUDGET,
     store: Path | None = None,
@@ -421,7 +374,7 @@ def sample(
     )
 
 
-def _completed(target: Target, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
+def _completed(target: MarginalPosterior, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
     """The first ``goal`` draws (ensemble, draw, walker, d) with scatters, and their log-posterior.
 
     Each proposal brings a draw of its scatters, which is accepted without regard to it.
@@ -438,12 +391,12 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
     return bool(np.all(draws.shape[1] > LENGTH_IN_TAU * pooled_time(draws)))
 
 
-def pilot(target: Target, seed: int) -> Schedule:
+def pilot(target: MarginalPosterior, seed: int) -> Schedule:
     """Find a proposal, and measure the autocorrelation time of its moves."""
     return (_emulated if target.can_be_emulated else _proposed)(target, np.random.RandomState(seed))
 
 
-def _proposed(target: Target, random: np.random.RandomState) -> Schedule:
+def _proposed(target: MarginalPosterior, random: np.random.RandomState) -> Schedule:
     """Moves by an adapted proposal.
 
     A short chain of the Laplace approximation does not show what it has missed; rounds of weighted draws find it.
@@ -454,7 +407,7 @@ def _proposed(target: Target, random: np.random.RandomState) -> Schedule:
     return Schedule(proposal, FIRST, moves, walkers.run(PILOT_STEPS))
 
 
-def _emulated(target: Target, random: np.random.RandomState) -> Schedule:
+def _emulated(target: MarginalPosterior, random: np.random.RandomState) -> Schedule:
     """Moves of delayed acceptance by an emulated posterior.
 
     A long autocorrelation time may mean that walkers stay where the emulator is wrong: it learns the motions there. The
@@ -472,14 +425,14 @@ def _emulated(target: Target, random: np.random.RandomState) -> Schedule:
     return first
 
 
-def _delayed(target: Target, found: Emulation, state: State) -> Schedule:
+def _delayed(target: MarginalPosterior, found: Emulation, state: State) -> Schedule:
     """Moves of delayed acceptance by the emulated posterior ``found``, and walkers that they move from ``state`` on."""
     moves = delayed_moves(found.target.parts, found.proposal, found.start.v, DELAYED_STEPS, target.scaled)
     return Schedule(found.start, DELAYED, moves, Ensemble(target.parts, state, moves).run(PILOT_STEPS))
 
 
 def adapted_proposal(
-    target: Target, random: np.random.RandomState, first: BlockProposal | None = None
+    target: MarginalPosterior, random: np.random.RandomState, first: BlockProposal | None = None
 ) -> BlockProposal:
     """Proposal adapted to the density of ``target``, from the Laplace approximation.
 
@@ -492,7 +445,7 @@ def adapted_proposal(
     return refined(target.parts, laplace, target.normal_priors, random, large, rounds)
 
 
-def laplace_proposal(target: Target) -> tuple[BlockProposal, list[bool]]:
+def laplace_proposal(target: MarginalPosterior) -> tuple[BlockProposal, list[bool]]:
     """The Laplace approximation as a proposal, and for each block whether it is large.
 
     A bench test is not: terms of a decay that may be absent need components that draw them from their priors.
@@ -530,7 +483,7 @@ def _advance(samplers: Sequence[Ensemble], goal: int, thin: int) -> Iterator[int
             yield sum(sampler.stored for sampler in samplers)
 
 
-def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
+def _sampler(target: MarginalPosterior, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
     """Return one ensemble: burnt in from its own start, or resumed from ``backend``.
 
     The starts are draws of the adapted proposal, or of the emulated posterior.
@@ -545,7 +498,7 @@ def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend
     return Ensemble(target.factors, burnt_in, schedule.moves, backend)
 
 
-def _initial(target: Target, density: BlockProposal | Places, random: np.random.RandomState) -> State:
+def _initial(target: MarginalPosterior, density: BlockProposal | Places, random: np.random.RandomState) -> State:
     """Walkers drawn from ``density``, each at a finite log-posterior."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
     u = np.empty((0, target.dimension))

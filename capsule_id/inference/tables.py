@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -14,11 +13,11 @@ from capsule_id.inference.checks.posterior import runs_alone
 from capsule_id.inference.checks.settings import SampledFit, Widening
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
 from capsule_id.inference.curvature import covariance
-from capsule_id.inference.least_squares import linearised
+from capsule_id.inference.least_squares import linearised, rows_of
 from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior
-from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.views import Finding, ResultTable
@@ -81,14 +80,9 @@ def smoothing_certificate(target: LogPosterior, fit: PointFit) -> ResultTable:
     return ResultTable("runs.smoothing", frame.rename_axis("parameter"), {**engines, **WIDTHS})
 
 
-@eqx.filter_jit
-def _evaluate(residual: HeldResiduals, v: Any) -> Any:
-    return residual(v)
-
-
 def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing | None) -> tuple[np.ndarray, np.ndarray]:
     """(d_located,) shift of u between a fit with the engine of ``widths`` (None: exact) and this fit, and the sd of u."""
-    own, jacobian = linearised(HeldResiduals(target, jnp.asarray(fit.u)), fit.u[target.located])
+    own, jacobian = linearised(target, fit.u, fit.u[target.located])
     normal = jacobian.T @ jacobian
     step = -np.linalg.solve(normal, jacobian.T @ (_residuals(_by_engine(target, widths), fit) - own))
     return step, np.sqrt(np.diag(np.linalg.inv(normal)))
@@ -100,8 +94,7 @@ def _by_engine(target: LogPosterior, widths: Smoothing | None) -> LogPosterior:
 
 def _residuals(target: LogPosterior, fit: PointFit) -> np.ndarray:
     """(n,) residuals at the point fit, in units of the noise."""
-    centre = jnp.asarray(fit.u)
-    return np.asarray(_evaluate(HeldResiduals(target, centre), centre[target.located]))
+    return np.asarray(rows_of(target, jnp.asarray(fit.u[None])))[0]
 
 
 def check_engine(sampled: SampledFit) -> list[Finding]:
@@ -275,8 +268,7 @@ def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, fl
         density += np.log(np.cosh(x)) + np.mean(0.5 * np.log(variance), axis=1) * np.sum(hat[rows])
         weight = np.exp(density - np.max(density))
         jacobian[rows] *= (misfit.at(own[symbol], np).sd / np.sqrt(weight @ variance / np.sum(weight)))[:, None]
-    matrix = covariance(jacobian)
-    errors = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    errors = np.sqrt(np.diag(covariance(jacobian))) * np.where(target.positive, theta, 1.0)[located]
     return {**fit.standard_errors, **{target.names[i]: float(sd) for i, sd in zip(located, errors, strict=True)}}
 
 

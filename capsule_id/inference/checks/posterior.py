@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 from scipy.fft import dct
@@ -18,10 +17,10 @@ from capsule_id.experiments.lint import WRONG_PREFIX
 from capsule_id.inference.checks.settings import DIFFERENCE, SMALLEST_SCATTER, SampledFit, moving_symbols
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.least_squares import linearised
-from capsule_id.inference.leave_out import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.moves import geyer_size
+from capsule_id.inference.prediction import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.result import PointFit, Pointwise, Posterior
-from capsule_id.inference.target import HeldResiduals, LogPosterior, prior_of
+from capsule_id.inference.target import LogPosterior, prior_of
 from capsule_id.parameters import Parameter, is_stated
 from capsule_id.views import Finding
 
@@ -46,7 +45,7 @@ class RunsAlone:
 def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
     """Estimate from runs and priors: one Gauss–Newton step from the joint ``fit`` without bench residuals."""
     located = target.located
-    misses, jacobian = linearised(HeldResiduals(target, jnp.asarray(fit.u)), fit.u[located])
+    misses, jacobian = linearised(target, fit.u, fit.u[located])
     rows = np.array([owner is None or not owner.bench for owner in target.residual_owners(fit.u)])
     kept = jacobian[rows]
     covariance = np.linalg.inv(kept.T @ kept)

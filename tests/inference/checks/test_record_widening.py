@@ -12,7 +12,7 @@ from capsule_id.experiments.forced_run.drives import BaseRun
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.inference.checks.settings import SampledFit
-from capsule_id.inference.checks.widening import (
+from capsule_id.inference.checks.verdict import (
     FEWEST_PARTS,
     PRIORS,
     by_phase,
