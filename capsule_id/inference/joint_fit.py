@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -63,7 +64,7 @@ def choose_starts(
     # Copies of the centre would agree with it without a proof.
     candidates = np.concatenate([centre[None], candidates[np.any(candidates != centre, axis=1)]])
     value = weigh(target, candidates)
-    if any(e.has_joint_scatters for e in target.experiments):
+    if target.kinked:
         candidates[1:], value[1:] = _descended(target, candidates[1:], value[1:])
     ranked = 1 + np.argsort(-value[1:])[: MAX_STARTS - 1]
     ranked = ranked[np.isfinite(value[ranked])]
@@ -172,8 +173,7 @@ def joint_fit(
     fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
     matrix[np.ix_(located, located)] = covariance(fit.jacobian[0])
-    scatters = np.flatnonzero(target.scatter)
-    matrix[scatters, scatters] = _scatter_variances(target, u[best])
+    matrix[np.diag_indices_from(matrix)] += _scatter_variances(target, u[best])
     return described(
         target,
         u[best],
@@ -235,7 +235,7 @@ def _choose_starts(
 def _compile_descent(target: LogPosterior) -> None:
     """Compile what ``_descend`` computes at a point."""
     u = dispersed_starts(target, 0, 1)
-    if any(e.has_joint_scatters for e in target.experiments):
+    if target.kinked:
         in_batches(partial(difference_descent.rows_of, target), u, difference_descent.ROWS)
     else:
         linearised(target, u[0], u[0, target.located])
@@ -298,7 +298,7 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
     """Descend from one start (d,); stop where the cost exceeds ``limit`` or a number is not finite."""
     located = target.located
     u, still, fit = start.copy(), False, None
-    kinked = any(e.has_joint_scatters for e in target.experiments)
+    kinked = target.kinked
     for _ in range(ROUNDS_WITH_KINKS if kinked else ROUNDS):
         stop_if_interrupted()
         if kinked:
@@ -345,10 +345,8 @@ def _is_converged(fit: LeastSquaresFit) -> bool:
 
 def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
     """Conditional maximum, in u, of every scatter given the located entries of u (d,), by index."""
-    groups = [(np.array([i]), lambda t, own=own: own(t[0])) for i, own in _scatter_terms(target, u).items()]
-    groups += [found for found in [_joint_scatters(target, u)] if len(found[0])]
     modes: dict[int, float] = {}
-    for members, density in groups:
+    for members, density in _scatter_densities(target, u):
         # The line search may try sizes that have no finite density, and rounding may end it at the maximum.
         with warnings.catch_warnings(), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
@@ -358,51 +356,43 @@ def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
 
 
 def _scatter_variances(target: LogPosterior, u: np.ndarray) -> np.ndarray:
-    """Inverse curvature of every scatter's conditional density at u (d,), in the order of the scatters."""
-    h, variances = 0.05, {}
-    members, together = _joint_scatters(target, u)
-    terms = _scatter_terms(target, u)
-    for place, i in enumerate(members.tolist()):
-        unit = np.eye(len(members))[place]
-        terms[i] = lambda t, unit=unit, i=i: together(u[members] + (t - u[i]) * unit)
-    for i, own in terms.items():
-        bend = (2.0 * own(u[i]) - own(u[i] + h) - own(u[i] - h)) / h**2
-        variances[i] = 1.0 / max(bend, 0.1)
-    return np.array([variances[i] for i in np.flatnonzero(target.scatter).tolist()])
+    """(d,) inverse curvature of every scatter's conditional density at u (d,); 0 for the located entries."""
+    h, variances = 0.05, np.zeros(len(u))
+    for members, density in _scatter_densities(target, u):
+        at = u[members]
+        for i, step in zip(members, h * np.eye(len(members)), strict=True):
+            bend = (2.0 * density(at) - density(at + step) - density(at - step)) / h**2
+            variances[i] = 1.0 / max(bend, 0.1)
+    return variances
 
 
-def _joint_scatters(target: LogPosterior, u: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], float]]:
-    """Indices of the scatters that only act together, and their log-density in u, up to a constant."""
-    own = [e for e in target.experiments if e.has_joint_scatters]
+def _scatter_densities(target: LogPosterior, u: np.ndarray) -> list[tuple[np.ndarray, Callable[[np.ndarray], float]]]:
+    """Indices of scatters, alone or those that only act together, and their log-density in u, up to a constant.
+
+    It is given the located entries of u (d,).
+    """
     values = target.mapping(target.theta(u))
-    names = dict.fromkeys(row.name for e in own for row in e.parameters if row.scatter)
-    members = np.array([target.names.index(name) for name in names], dtype=int)
-    profiles = [(e.profile(e.local(values)), {r.symbol: r.name for r in e.parameters if r.scatter}) for e in own]
-    priors = target.priors.at(members, np)
+    parts, profiles = dict[int, list[Misfit | Moments]](), list[tuple[Callable[..., float], dict[str, int]]]()
+    for e in target.experiments:
+        own = e.local(values)
+        index = {row.symbol: target.names.index(row.name) for row in e.parameters if row.scatter}
+        if e.has_joint_scatters:
+            profiles.append((e.profile(own), index))
+            continue
+        for part, symbol in zip(e.summaries(own, np), e.scatters, strict=True):
+            if symbol is not None:
+                parts.setdefault(index[symbol], []).append(part)
+
+    def prior(members: Any, t: Any) -> Any:
+        return target.priors.at(members, np).terms(t, np.exp(t), np)
+
+    def alone(i: int, t: np.ndarray) -> float:
+        return float(sum(part.log_density(np.exp(t[0]), np) for part in parts[i]) + prior(i, t[0]))
 
     def together(t: np.ndarray) -> float:
-        sizes = dict(zip(names, np.exp(t), strict=True))
-        total = sum(profile({s: sizes[name] for s, name in rows.items()}) for profile, rows in profiles)
-        return float(total + np.sum(priors.terms(t, np.exp(t), np)))
+        sizes = dict(zip(joint.tolist(), np.exp(t), strict=True))
+        total = sum(profile({s: sizes[i] for s, i in index.items()}) for profile, index in profiles)
+        return float(total + np.sum(prior(joint, t)))
 
-    return members, together
-
-
-def _scatter_terms(target: LogPosterior, u: np.ndarray) -> dict[int, Callable[[float], float]]:
-    """log-density of each scatter that acts alone, given the located entries of u (d,), up to a constant, by index."""
-    values = target.mapping(target.theta(u))
-    parts: dict[int, list[Misfit | Moments]] = {}
-    for experiment in target.experiments:
-        if experiment.has_joint_scatters:
-            continue
-        names = {row.symbol: row.name for row in experiment.parameters}
-        for part, symbol in zip(experiment.summaries(experiment.local(values), np), experiment.scatters, strict=True):
-            if symbol is not None:
-                parts.setdefault(target.names.index(names[symbol]), []).append(part)
-    priors = {i: target.priors.at(i, np) for i in parts}
-
-    def terms(i: int, t: float) -> float:
-        own = sum(part.log_density(np.exp(t), np) for part in parts[i])
-        return float(own + priors[i].terms(np.float64(t), np.exp(t), np))
-
-    return {i: partial(terms, i) for i in parts}
+    joint = np.array(list(dict.fromkeys(i for _, index in profiles for i in index.values())), dtype=int)
+    return [*((np.array([i]), partial(alone, i)) for i in parts), *([(joint, together)] if len(joint) else [])]

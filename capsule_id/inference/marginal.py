@@ -381,7 +381,7 @@ class MarginalPosterior:
         direction = np.random.default_rng(0).standard_normal((2 * BATCH, self.dimension))
         for block in self.blocks:
             direction[:, block] /= np.linalg.norm(direction[:, block], axis=1, keepdims=True)
-        kinked = any(e.has_joint_scatters for e in self.target.experiments)
+        kinked = self.target.kinked
         farthest = FARTHEST_WITH_KINKS if kinked else FARTHEST
         radius = np.concatenate([[0.0], np.geomspace(NEAREST, farthest, BATCH - 1)])
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T

@@ -10,12 +10,11 @@ import pandas as pd
 from capsule_id.experiments import paper_estimates
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.checks.posterior import runs_alone
-from capsule_id.inference.checks.settings import SampledFit, Widening
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
 from capsule_id.inference.curvature import covariance
 from capsule_id.inference.least_squares import linearised, rows_of
 from capsule_id.inference.point_fit import residual_jacobian
-from capsule_id.inference.point_stage import BenchFit
+from capsule_id.inference.point_stage import SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, parameter
@@ -31,15 +30,16 @@ WIDTHS = {name: getattr(Smoothing(), name) for name in ("velocity", "penetration
 SMALL_SHIFT, LARGE_SHIFT = 0.2, 1.0
 
 
-def precision_gained(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> ResultTable:
+def precision_gained(s: SampledFit) -> ResultTable:
     """Posterior sd from bench only, runs only, and both; from samples where they exist, else from point fits."""
+    target, joint = s.target, s.fit
     shared, known = shared_symbols(target), run_parameters(target)
     alone = runs_alone(target, joint)
     sds = dict(zip(alone.names, np.sqrt(np.diag(alone.covariance)), strict=True))
     runs = {name: float(sd * abs(joint.values[name])) if name in known else np.nan for name, sd in sds.items()}
     rows = {}
     for name in (row.name for row in target.parameters if row.symbol in shared):
-        rows[name] = [_sd(bench.fit, bench.sample, name), runs[name], _sd(joint, sample, name)]
+        rows[name] = [_sd(s.bench, s.bench_sample, name), runs[name], _sd(joint, s.posterior, name)]
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["bench only", "runs only", "both"])
     frame["bench only / both"] = frame["bench only"] / frame["both"]
     return ResultTable("runs.precision", frame.rename_axis("parameter"))
@@ -106,7 +106,7 @@ def check_engine(sampled: SampledFit) -> list[Finding]:
     moved = [e for e in target.experiments if e.event_driven]
     if target.rig.model.engine == "exact" or not moved:
         return []
-    if any(e.has_joint_scatters for e in target.experiments):
+    if target.kinked:
         bound = np.linalg.norm(_residuals(_by_engine(target, None), fit) - _residuals(target, fit))
         shifts = {row.name: float(bound) for e in moved for row in e.parameters if row.physical}
     else:
@@ -142,9 +142,9 @@ def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> l
         for found in sampled.findings
         if (rows := found.facts.get("alternatives"))
     ]
-    kinked = any(e.has_joint_scatters for e in sampled.experiments)
+    kinked = target.kinked
     if any(not e.bench for e in sampled.experiments) and not kinked:
-        gained = precision_gained(target, fit, sampled.posterior, sampled.bench)
+        gained = precision_gained(sampled)
         of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
     tables = [*of_runs, *of_bench, *compared, *([] if kinked else share_table(target, fit)), prior_table(target)]
     return [*tables, predictive_table(sampled, predictive)] if sampled.draws else tables

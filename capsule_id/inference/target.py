@@ -355,6 +355,11 @@ class LogPosterior(eqx.Module):
         return np.flatnonzero(~self.scatter)
 
     @property
+    def kinked(self) -> bool:
+        """Whether scatters act together: residuals have kinks in the parameters there, and derivatives say little."""
+        return any(e.has_joint_scatters for e in self.experiments)
+
+    @property
     def scaled(self) -> list[Scale]:
         """Each scatter of which only the product with other parameters changes the motion."""
         scaled, balanced = dict[str, set[str]](), dict[str, set[str]]()

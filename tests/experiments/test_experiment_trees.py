@@ -19,10 +19,10 @@ from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.marginal import conditional, density_of
 from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.tables import make_notes
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior

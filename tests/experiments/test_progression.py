@@ -17,8 +17,8 @@ from capsule_id.experiments.progression.declaration import KIND
 from capsule_id.experiments.progression.density import INNER, NODES
 from capsule_id.experiments.progression.experiment import Progression, check_discrepancy
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.joint_fit import _rescaled
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.tables import check_engine
 from capsule_id.inference.target import LogPosterior

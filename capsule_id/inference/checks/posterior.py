@@ -14,10 +14,11 @@ from scipy.ndimage import gaussian_filter1d
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.lint import WRONG_PREFIX
-from capsule_id.inference.checks.settings import DIFFERENCE, SMALLEST_SCATTER, SampledFit, moving_symbols
+from capsule_id.inference.checks.settings import DIFFERENCE, SMALLEST_SCATTER, moving_symbols
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.moves import geyer_size
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.prediction import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.result import PointFit, Pointwise, Posterior
 from capsule_id.inference.target import LogPosterior, prior_of
@@ -116,21 +117,21 @@ def _quantile_of_log_tail(log_tail: float) -> float:
     return float(np.interp(-log_tail, -stats.norm.logsf(z), z))
 
 
-def check_agreement(
-    target: LogPosterior, joint: PointFit, bench: PointFit | None, sample: Posterior | None
-) -> list[Finding]:
+def check_agreement(s: SampledFit) -> list[Finding]:
     """Check that bench tests and runs are consistent (two-sided, Šidák over the shared parameters).
 
     Masses are excluded, because both estimates contain their weighings.
     """
-    known = {row.name for e in target.experiments if not e.bench for row in e.parameters}
-    shared = [] if bench is None else [name for name in bench.names if name in known]
-    found = disagreement(shared, runs_alone(target, joint), bench, sample) if bench is not None and shared else {}
+    known = {row.name for e in s.experiments if not e.bench for row in e.parameters}
+    shared = [] if s.bench is None else [name for name in s.bench.names if name in known]
+    if s.bench is None or not shared:
+        return []
+    found = disagreement(shared, runs_alone(s.target, s.fit), s.bench, s.bench_sample)
     tests = {
-        name: [e.label for e in target.experiments if e.bench and name in {row.name for row in e.parameters}]
+        name: [e.label for e in s.experiments if e.bench and name in {row.name for row in e.parameters}]
         for name in found
     }
-    return [agreement(found, sample is not None, tests)] if found else []
+    return [agreement(found, s.bench_sample is not None, tests)]
 
 
 def agreement(

@@ -22,8 +22,9 @@ from capsule_id.inference.checks.posterior import (
     default_scatter,
     in_doubt,
 )
-from capsule_id.inference.checks.settings import MOST_FLAGGED, SampledFit, Widening, check_trials, outliers
+from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, outliers
 from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.point_stage import SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.inference.target import LogPosterior

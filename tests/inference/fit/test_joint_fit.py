@@ -22,7 +22,6 @@ from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.inference import joint_fit as joint_starts
 from capsule_id.inference import joint_fit as module
 from capsule_id.inference.checks.posterior import check_starts
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.joint_fit import (
     LEAST_INCREASE,
     STARTS,
@@ -38,6 +37,7 @@ from capsule_id.inference.joint_fit import (
 )
 from capsule_id.inference.least_squares import Solver, linearised
 from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.sampling import laplace_proposal
 from capsule_id.inference.tables import check_engine, smoothing_shift
