@@ -404,7 +404,7 @@ class Ensemble:
     @property
     def stored(self) -> int:
         """Number of stored draws."""
-        return self._sampler.iteration
+        return int(self._sampler.iteration)
 
     @property
     def chain(self) -> np.ndarray:

@@ -104,8 +104,7 @@ class Emulation(NamedTuple):
         """``number`` draws (w, d) of the emulated posterior, by chains that go on from ``start``."""
         found = [self.start.v]
         while sum(map(len, found)) < number:
-            chain = _chain(self.target, found[-1], block_move(self.proposal), random)
-            found.append(chain.run(STEPS, store=False).state.coords)
+            found.append(_walked(self.target, found[-1], block_move(self.proposal), random))
         return np.concatenate(found)[:number]
 
 
@@ -130,11 +129,17 @@ def emulation(
         If hardly any draw has finite motions, or a finite log-density.
     """
     adaptations, last_rounds = (None, DELAYED_ROUNDS) if known is None else (AGAIN, 0)
-    known, proposal = known or _first_motions(target, first, random), first
+    if known is None:
+        v = _finite(first, random, FIRST_DRAWS)
+        known = ExactMotions(v, target.motions(v))
+        if any(np.sum(np.all(np.isfinite(own), axis=1)) < 2 * v.shape[1] for own in known.motions):
+            raise RuntimeError(NO_MASS)
+    proposal = first
     for _ in range(ROUNDS):
         emulated = target.emulated(*known)
         proposal = refined(emulated.parts, proposal, target.normal_priors, random, large, adaptations)
-        drawn, adaptations = _draws(emulated, proposal, random), AGAIN
+        v = _inside(emulated, _finite(proposal, random, 2 * DRAWS))[:DRAWS]
+        drawn, adaptations = _walked(emulated, v, block_move(proposal), random), AGAIN
         checked = drawn[:CHECKED]
         log_weight = np.sum(target.parts(checked), axis=1) - np.sum(emulated.parts(checked), axis=1)
         known = known.more(target, np.concatenate([_around(drawn, random) for _ in range(PLACES)]))
@@ -144,7 +149,7 @@ def emulation(
     found = _adapted(target, known, proposal, drawn, large, random)
     for _ in range(last_rounds):
         moves = delayed_moves(found.target.parts, found.proposal, found.start.v, STEPS, target.scaled, OTHER)
-        walkers = _chain(target, walkers, moves, random).run(EXACT_STEPS, store=False).state.coords
+        walkers = _walked(target, walkers, moves, random, EXACT_STEPS)
         found = corrected(target, found, walkers, large, random)
     return found
 
@@ -154,9 +159,14 @@ def corrected(
 ) -> Emulation:
     """Emulate ``target`` with further exact motions about ``walkers`` (w, d) of delayed acceptance by ``before``.
 
-    Walkers stay where the emulated density is far too small, so that the motions added there correct it.
+    Walkers stay where the emulated density is far too small, so that the motions added there correct it. Draws of the
+    wide proposal give further motions.
     """
-    known = before.known.more(target, _last_places(before.target, before.proposal, walkers, random))
+    emulated, wide = before.target, _finite(before.proposal, random, 2 * DRAWS)
+    least = np.median(np.sum(emulated.parts(walkers), axis=1)) - FAR
+    wide = wide[np.sum(emulated.parts(wide), axis=1) > least][:DRAWS]
+    places = [wide, *(_around(walkers, random) for _ in range(max(1, DRAWS // len(walkers))))]
+    known = before.known.more(target, np.concatenate(places))
     return _adapted(target, known, before.proposal, before.start.v, large, random)
 
 
@@ -168,26 +178,26 @@ def _adapted(
     large: list[bool],
     random: np.random.RandomState,
 ) -> Emulation:
-    """Emulator of ``known``, with the proposal and the draws of a chain from v (w, d) that follow it."""
+    """Emulator of ``known``, its proposal with maps of the large blocks, and the last places of a chain from v (w, d).
+
+    The maps follow the chain, whose draws determine a map better than weighted draws: few of these hold most of the weight.
+    """
     emulated = target.emulated(*known)
-    proposal, drawn = _follow(emulated, proposal, v, large, random)
-    return Emulation(emulated, known, proposal, Places(drawn))
+    for _ in range(MAPS):
+        ensemble = _chain(emulated, v, block_move(proposal), random).run(STEPS)
+        v = ensemble.state.coords
+        drawn = np.concatenate([v, ensemble.chain[STEPS // 2]])
+        equal = np.full(len(drawn), 1.0 / len(drawn))
+        pairs = zip(proposal.blocks, proposal.densities, large, strict=True)
+        maps = [Transported(drawn[:, b], equal) if own and len(b) <= LARGEST_MAP else q for b, q, own in pairs]
+        proposal = BlockProposal(proposal.blocks, maps)
+    return Emulation(emulated, known, proposal, Places(v))
 
 
-def _first_motions(target: MarginalPosterior, first: BlockProposal, random: np.random.RandomState) -> ExactMotions:
-    v = first.draw(random, FIRST_DRAWS)
-    v = v[np.all(np.isfinite(v), axis=1)]
-    motions = target.motions(v)
-    if any(np.sum(np.all(np.isfinite(own), axis=1)) < 2 * v.shape[1] for own in motions):
-        raise RuntimeError(NO_MASS)
-    return ExactMotions(v, motions)
-
-
-def _draws(target: MarginalPosterior, proposal: BlockProposal, random: np.random.RandomState) -> np.ndarray:
-    """``DRAWS`` draws of ``target``: the last places of as many walkers that begin with draws of ``proposal``."""
-    v = proposal.draw(random, 2 * DRAWS)
-    v = _inside(target, v[np.all(np.isfinite(v), axis=1)])[:DRAWS]
-    return _chain(target, v, block_move(proposal), random).run(STEPS, store=False).state.coords
+def _finite(density: BlockProposal | Places, random: np.random.RandomState, size: int) -> np.ndarray:
+    """Those of ``size`` draws (size, d) that are finite."""
+    v = density.draw(random, size)
+    return v[np.all(np.isfinite(v), axis=1)]
 
 
 def _inside(target: MarginalPosterior, v: np.ndarray) -> np.ndarray:
@@ -204,38 +214,16 @@ def _chain(target: MarginalPosterior, v: np.ndarray, moves: Moves, random: np.ra
     return Ensemble(target.parts, initial_state(v, own), moves)
 
 
+def _walked(
+    target: MarginalPosterior, v: np.ndarray, moves: Moves, random: np.random.RandomState, steps: int = STEPS
+) -> np.ndarray:
+    """Last places (w, d) of walkers from v (w, d)."""
+    return _chain(target, v, moves, random).run(steps, store=False).state.coords
+
+
 def _around(v: np.ndarray, random: np.random.RandomState) -> np.ndarray:
     """Draws v (w, d) with normal noise: the emulator needs motions around the posterior too, not only inside it."""
     return v + NOISE * random.multivariate_normal(np.zeros(v.shape[1]), np.atleast_2d(np.cov(v.T)), len(v))
-
-
-def _last_places(
-    emulated: MarginalPosterior, proposal: BlockProposal, walkers: np.ndarray, random: np.random.RandomState
-) -> np.ndarray:
-    """Places about ``walkers`` (w, d) of delayed acceptance, and draws of the wide proposal."""
-    wide = proposal.draw(random, 2 * DRAWS)
-    wide = wide[np.all(np.isfinite(wide), axis=1)]
-    least = np.median(np.sum(emulated.parts(walkers), axis=1)) - FAR
-    wide = wide[np.sum(emulated.parts(wide), axis=1) > least][:DRAWS]
-    return np.concatenate([wide, *(_around(walkers, random) for _ in range(max(1, DRAWS // len(walkers))))])
-
-
-def _follow(
-    target: MarginalPosterior, proposal: BlockProposal, v: np.ndarray, large: list[bool], random: np.random.RandomState
-) -> tuple[BlockProposal, np.ndarray]:
-    """Proposal with maps of the large blocks that follow a chain of ``target`` from draws v (w, d), and its last places.
-
-    Draws of a chain determine a map better than weighted draws: few of these hold most of the weight.
-    """
-    for _ in range(MAPS):
-        ensemble = _chain(target, v, block_move(proposal), random).run(STEPS)
-        v = ensemble.state.coords
-        drawn = np.concatenate([v, ensemble.chain[STEPS // 2]])
-        equal = np.full(len(drawn), 1.0 / len(drawn))
-        pairs = zip(proposal.blocks, proposal.densities, large, strict=True)
-        maps = [Transported(drawn[:, b], equal) if own and len(b) <= LARGEST_MAP else q for b, q, own in pairs]
-        proposal = BlockProposal(proposal.blocks, maps)
-    return proposal, v
 
 
 # ensembles: Sampling by independent emcee ensembles until convergence or a step limit, with regular saving.
@@ -308,11 +296,6 @@ class Schedule:
         """Steps per stored draw of the recorded run."""
         return int(np.clip(self.tau / DRAWS_PER_TAU, 1, MAX_THIN))
 
-    @property
-    def burn_in(self) -> int:
-        """Steps of an ensemble before its first stored draw."""
-        return int(np.ceil(BURN_IN_IN_TAU * self.tau))
-
 
 def sample(
     target: MarginalPosterior,
@@ -349,7 +332,10 @@ def sample(
                 if chains is not None:
                     chains.between_draws()
                 report(done, ENSEMBLES * goal, schedule.move)
-            draws, lp = _completed(target, samplers, goal)
+            # Each proposal brings a draw of its scatters, which is accepted without regard to it.
+            located = np.stack([sampler.chain[:goal] for sampler in samplers])
+            factors = np.stack([sampler.parts[:goal] for sampler in samplers])
+            draws, lp = target.whole(located, factors.reshape(*factors.shape[:3], len(target.blocks), -1))
             if _converged(draws, ess):
                 break
         if chains is not None:
@@ -374,16 +360,6 @@ def sample(
     )
 
 
-def _completed(target: MarginalPosterior, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first ``goal`` draws (ensemble, draw, walker, d) with scatters, and their log-posterior.
-
-    Each proposal brings a draw of its scatters, which is accepted without regard to it.
-    """
-    located = np.stack([sampler.chain[:goal] for sampler in samplers])
-    factors = np.stack([sampler.parts[:goal] for sampler in samplers])
-    return target.whole(located, factors.reshape(*factors.shape[:3], len(target.blocks), -1))
-
-
 def _converged(draws: np.ndarray, ess: float) -> bool:
     """Whether draws (ensemble, draw, walker, d) are long enough and their ensembles agree."""
     if not np.all(split_rhat(draws) <= MAX_RHAT) or not np.all(bulk_and_tail_size(draws) >= ess):
@@ -392,15 +368,13 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
 
 
 def pilot(target: MarginalPosterior, seed: int) -> Schedule:
-    """Find a proposal, and measure the autocorrelation time of its moves."""
-    return (_emulated if target.can_be_emulated else _proposed)(target, np.random.RandomState(seed))
-
-
-def _proposed(target: MarginalPosterior, random: np.random.RandomState) -> Schedule:
-    """Moves by an adapted proposal.
+    """Find a proposal, and measure the autocorrelation time of its moves.
 
     A short chain of the Laplace approximation does not show what it has missed; rounds of weighted draws find it.
     """
+    random = np.random.RandomState(seed)
+    if target.can_be_emulated:
+        return _emulated(target, random)
     proposal = adapted_proposal(target, random)
     moves = block_move(proposal)
     walkers = Ensemble(target.parts, _initial(target, proposal, random), moves)
@@ -439,10 +413,8 @@ def adapted_proposal(
     A proposal ``first`` that is adapted to a similar density takes its place, and needs ``NEAR`` rounds only.
     """
     laplace, large = laplace_proposal(target)
-    if first is not None:
-        return refined(target.parts, first, target.normal_priors, random, large, NEAR)
-    rounds = affordable_rounds(PILOT_WORK / target.work)
-    return refined(target.parts, laplace, target.normal_priors, random, large, rounds)
+    rounds = affordable_rounds(PILOT_WORK / target.work) if first is None else NEAR
+    return refined(target.parts, first or laplace, target.normal_priors, random, large, rounds)
 
 
 def laplace_proposal(target: MarginalPosterior) -> tuple[BlockProposal, list[bool]]:
@@ -492,7 +464,8 @@ def _sampler(target: MarginalPosterior, schedule: Schedule, seed: int, backend: 
     if last is not None:
         return Ensemble(target.factors, last, schedule.moves, backend)
     start = _initial(target, schedule.start, np.random.RandomState(seed))
-    burnt_in = Ensemble(target.factors, start, schedule.moves).run(schedule.burn_in, store=False).state
+    steps = int(np.ceil(BURN_IN_IN_TAU * schedule.tau))
+    burnt_in = Ensemble(target.factors, start, schedule.moves).run(steps, store=False).state
     if backend is not None:
         backend.reset(*start.coords.shape)
     return Ensemble(target.factors, burnt_in, schedule.moves, backend)
@@ -503,8 +476,7 @@ def _initial(target: MarginalPosterior, density: BlockProposal | Places, random:
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
     u = np.empty((0, target.dimension))
     for _ in range(100):
-        drawn = density.draw(random, walkers)
-        drawn = drawn[np.all(np.isfinite(drawn), axis=1)]
+        drawn = _finite(density, random, walkers)
         u = np.concatenate([u, drawn[np.all(np.isfinite(target.parts(drawn)), axis=1)]])
         if len(u) >= walkers:
             return initial_state(u[:walkers], random)

@@ -22,7 +22,7 @@ from capsule_id.inference.checks.posterior import (
     default_scatter,
     in_doubt,
 )
-from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, outliers
+from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, judged, outliers
 from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
@@ -68,11 +68,9 @@ def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:
     failed = [concerned(f, sampled.experiments) for f in sampled.findings if f.level == "fail"]
     doubtful = {name for f in sampled.findings if f.level == "warn" for name in f.parameters}
     few = {f.experiment for f in sampled.findings if f.code == "readings.few"}
-    sizes: dict[str, list[bool]] = {}
-    for e in sampled.experiments:
-        for row in e.parameters:
-            sizes.setdefault(row.name, []).append(e.table.label in few)
-    doubtful |= {name for name, are_few in sizes.items() if all(are_few) and not is_stated(name)}
+    enough = {row.name for e in sampled.experiments if e.table.label not in few for row in e.parameters}
+    read = {row.name for e in sampled.experiments for row in e.parameters}
+    doubtful |= {name for name in read - enough if not is_stated(name)}
     words: dict[str, Trust] = {}
     for row, known in zip(sampled.target.parameters, informed, strict=True):
         judged = sampled.posterior is not None and (known or is_stated(row.name)) and row.name not in doubtful
@@ -127,16 +125,12 @@ def check_outliers(s: SampledFit) -> tuple[list[Finding], dict[str, list[int]]]:
 
 def check_stated_errors(s: SampledFit) -> list[Finding]:
     """Check that stated reading errors explain the scatter (chi-square)."""
-    known = [e for e in s.experiments if e.scale_known and e.label not in s.flagged]
-    findings = []
-    for e in known:
+    cases = []
+    for e in (e for e in s.experiments if e.scale_known and e.label not in s.flagged):
         square = float(np.sum(np.asarray(e.residuals(e.local(s.values), np))[: e.n] ** 2))
-        freedom = e.n - 2
-        p = float(stats.chi2.sf(square, freedom)) if freedom > 0 else 1.0
-        if p * len(known) < LEVEL:
-            facts = {"freedom": freedom, "chi_square": square, "p": p}
-            findings.append(Finding("errors.stated", "fail", facts, e.label))
-    return findings or [Finding("errors.stated", "ok")] * bool(known)
+        p = float(stats.chi2.sf(square, e.n - 2)) if e.n > 2 else 1.0
+        cases.append((e.label, p, {"freedom": e.n - 2, "chi_square": square, "p": p}))
+    return judged("errors.stated", cases, LEVEL)
 
 
 # verdict: All checks of a fit: each finding states the experiment, the expected value, the observed value and a remedy.
