@@ -112,11 +112,6 @@ def prior_sd(row: Parameter) -> float:
     return prior.spread
 
 
-def override(row: Parameter, stated: Prior | None) -> Parameter:
-    """Return the row with the prior of ``rig.toml``, where one is stated."""
-    return row if stated is None else row.named(row.of, stated)
-
-
 def covering_prior(name: str, priors: Sequence[Prior]) -> Prior:
     """Return the prior of a parameter that several experiments share, whatever their order.
 
@@ -215,7 +210,7 @@ def _group(experiments: Sequence[Experiment], members: Sequence[int], place: Map
     own = [{row.symbol: row.name for row in e.parameters} for e in experiments]
     sampled = [*dict.fromkeys(s for table in own for s in table), *(m for m in first.masses if m in place)]
     entries = tuple((s, tuple(place.get(table.get(s, s), len(place)) for table in own)) for s in sampled)
-    stacked = jax.tree.map(_stack, *experiments)
+    stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves).astype(float)), *experiments)
     # The stack has the static fields of its first member; no likelihood may read its table.
     object.__setattr__(stacked, "about", Unavailable())
     return Group(stacked, tuple(members), entries)
@@ -233,10 +228,6 @@ def _check_leaves(experiment: Experiment) -> None:
         if np.asarray(leaf).dtype.kind not in "fiu":
             field = f"{type(experiment).__name__}{jax.tree_util.keystr(path)}"
             raise TypeError(f"{field} must be a number, found {leaf!r}: declare it with eqx.field(static=True)")
-
-
-def _stack(*leaves: Any) -> jax.Array:
-    return jnp.asarray(np.stack([np.asarray(leaf, dtype=float) for leaf in leaves]))
 
 
 # log posterior: Joint log-posterior of all experiments in an unconstrained space.
@@ -300,9 +291,10 @@ class LogPosterior(eqx.Module):
             for row in experiment.parameters:
                 offered.setdefault(row.name, []).append(row)
         for name, (row, *others) in offered.items():
-            if others and name not in rig.priors:
-                row = row.named(row.of, covering_prior(name, [prior_of(one) for one in (row, *others)]))
-            rows.setdefault(name, override(row, rig.priors.get(name)))
+            prior = rig.priors.get(name)
+            if others and prior is None:
+                prior = covering_prior(name, [prior_of(one) for one in (row, *others)])
+            rows.setdefault(name, row if prior is None else row.named(row.of, prior))
         self.origin = Origin(rig, tuple(experiments), tuple(rows.values()), fixed)
         self.names = tuple(rows)
         self.are_positive = tuple(row.positive for row in rows.values())
