@@ -146,8 +146,19 @@ def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> l
     if any(not e.bench for e in sampled.experiments) and not kinked:
         gained = precision_gained(sampled)
         of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
-    tables = [*of_runs, *of_bench, *compared, *([] if kinked else share_table(target, fit)), prior_table(target)]
-    return [*tables, predictive_table(sampled, predictive)] if sampled.draws else tables
+    priors = [
+        {"parameter": row.name, "unit": row.unit, "meaning": row.meaning, "prior (SI)": row.prior.describe()}
+        for row in target.parameters
+        if row.prior is not None
+    ]
+    tables = [*of_runs, *of_bench, *compared, *([] if kinked else share_table(target, fit))]
+    tables.append(ResultTable("parameters.priors", pd.DataFrame(priors).set_index("parameter")))
+    if sampled.draws:
+        # Experiments on the shared friction panel have a p-value too.
+        rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in sampled.experiments}
+        frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"])
+        tables.append(ResultTable("readings.predictive", frame.rename_axis("experiment")))
+    return tables
 
 
 def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
@@ -160,23 +171,6 @@ def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
         rows, orient="index", columns=["largest input", "share", "second input", "share of it"]
     )
     return [ResultTable("parameters.shares", frame.round(3).rename_axis("parameter"))] * bool(rows)
-
-
-def prior_table(target: LogPosterior) -> ResultTable:
-    """Every parameter with its prior, SI."""
-    rows = [
-        {"parameter": row.name, "unit": row.unit, "meaning": row.meaning, "prior (SI)": row.prior.describe()}
-        for row in target.parameters
-        if row.prior is not None
-    ]
-    return ResultTable("parameters.priors", pd.DataFrame(rows).set_index("parameter"))
-
-
-def predictive_table(sampled: SampledFit, predictive: Mapping[str, float | None]) -> ResultTable:
-    """Posterior predictive p-value of every experiment, those on the shared friction panel included."""
-    rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in sampled.experiments}
-    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"])
-    return ResultTable("readings.predictive", frame.rename_axis("experiment"))
 
 
 # parameter table: The parameter table and the nuisance table of a result.
@@ -209,7 +203,7 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
     words = trust_words(sampled, known)
     rows: list[tuple[Parameter, dict[str, object]]] = []
     for i, row in enumerate(target.parameters):
-        entry: dict[str, object] = {
+        entry: dict[str, Any] = {
             "unit": row.unit,
             "meaning": row.meaning,
             "paper": paper.get(row.name, np.nan),
@@ -221,9 +215,15 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             "standard_error": at_point[row.name],
             "informed": bool(known[i]),
         }
-        entry |= {} if posterior is None else _sample_columns(posterior, i)
+        if posterior is not None:
+            draws = posterior.draws[..., i].ravel()
+            lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
+            entry |= {"value": median, "sd": np.std(draws, ddof=1), "basis": "sample"}
+            entry |= {"mean": np.mean(draws), "median": median, "lower": lower, "upper": upper}
+            entry |= {name: getattr(posterior, name)[i] for name in ("ess", "ess_bulk", "ess_tail", "rhat")}
         entry |= _widened(entry, sampled.widened.get(row.name), row.positive)
-        entry |= _limited(entry) if row.positive else {}
+        if row.positive and "lower" in entry and entry["lower"] * UPPER_LIMIT < entry["upper"]:
+            entry["lower"] = 0.0
         rows.append((row, {**entry, "quote": quote(entry, row.positive)}))
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
@@ -291,11 +291,6 @@ def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool
     return found
 
 
-def _limited(entry: Mapping[str, Any]) -> dict[str, object]:
-    """The lower end 0 where the readings give an upper limit alone."""
-    return {"lower": 0.0} if "lower" in entry and entry["lower"] * UPPER_LIMIT < entry["upper"] else {}
-
-
 def quote(entry: Mapping[str, Any], positive: bool) -> Literal["sd", "interval"]:
     """What describes a value beside it: its sd, or the 95 % interval of a skewed posterior.
 
@@ -307,21 +302,3 @@ def quote(entry: Mapping[str, Any], positive: bool) -> Literal["sd", "interval"]
     short, long = sorted((entry["value"] - entry["lower"], entry["upper"] - entry["value"]))
     outside = positive and entry["value"] <= 2.0 * entry["sd"]
     return "interval" if outside or long > LARGEST_SKEW * short else "sd"
-
-
-def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
-    draws = posterior.draws[..., i].ravel()
-    lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
-    return {
-        "value": median,
-        "sd": np.std(draws, ddof=1),
-        "basis": "sample",
-        "mean": np.mean(draws),
-        "median": median,
-        "lower": lower,
-        "upper": upper,
-        "ess": posterior.ess[i],
-        "ess_bulk": posterior.ess_bulk[i],
-        "ess_tail": posterior.ess_tail[i],
-        "rhat": posterior.rhat[i],
-    }

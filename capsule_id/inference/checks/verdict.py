@@ -30,7 +30,6 @@ from capsule_id.inference.sampling import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import is_stated
 from capsule_id.records.tones import length_of_motion
-from capsule_id.rig.model import Table
 from capsule_id.views import Finding, Trust
 
 # trust: Which numbers of a fit may be quoted, from its findings.
@@ -148,6 +147,9 @@ def run_checks(sampled: SampledFit) -> SampledFit:
     outliers, flagged = check_outliers(sampled)
     sampled = replace(sampled, flagged=flagged)
     trials = check_trials(sampled)
+    pairs = zip(sampled.target.parameters, informed(sampled.target, sampled.posterior, sampled.fit), strict=True)
+    # No other reading narrows a stated mass or slope. A scatter with a stated reading error may be zero.
+    vague = [row.name for row, known in pairs if row.physical and not is_stated(row.name) and not known]
     findings = [
         *check_starts(sampled.fit, sampled.target, sampled.posterior),
         *check_maximum(sampled),
@@ -158,7 +160,7 @@ def run_checks(sampled: SampledFit) -> SampledFit:
         *trials,
         *check_statistics(sampled, {finding.experiment for finding in trials if finding.level == "fail"}),
         *_declared_findings(sampled, bench=True),
-        *_informed(sampled),
+        Finding("parameters.informed", "warn" if vague else "ok", {"names": ", ".join(vague)}),
         *check_priors(sampled),
         *_boundary(sampled),
         *_declared_findings(sampled, bench=False),
@@ -220,17 +222,6 @@ def informed(target: LogPosterior, posterior: Posterior | None, fit: PointFit) -
         flat = posterior.draws.reshape(-1, len(posterior.names))
         sd = np.std(target.unconstrain(flat), axis=0)
     return sd <= INFORMED_RATIO * target.prior_sd
-
-
-def _informed(s: SampledFit) -> list[Finding]:
-    known = informed(s.target, s.posterior, s.fit)
-    # No other reading narrows a stated mass or slope. A scatter with a stated reading error may be zero.
-    names = [
-        row.name
-        for row, ok in zip(s.target.parameters, known, strict=True)
-        if row.physical and not is_stated(row.name) and not ok
-    ]
-    return [Finding("parameters.informed", "warn" if names else "ok", {"names": ", ".join(names)})]
 
 
 def _boundary(s: SampledFit) -> list[Finding]:
@@ -330,7 +321,9 @@ def estimates_of_parts(
     parts = []
     for rows in rows_of_parts(e, values, number, by_load):
         try:
-            (part,) = type(e).make(rows_of(e.table, rows), e.rig, getattr(e, "friction", EQUATION_1))
+            columns = {name: replace(own, values=own.values[rows]) for name, own in e.table.columns.items()}
+            table = replace(e.table, columns=columns, rows=e.table.rows[rows])
+            (part,) = type(e).make(table, e.rig, getattr(e, "friction", EQUATION_1))
             with np.errstate(all="ignore"):
                 parts.append((part, estimate(part, part.local(values), [])))
         except (InputError, ValueError, np.linalg.LinAlgError, IndexError, ArithmeticError):
@@ -350,7 +343,10 @@ def estimates_of_parts(
 def rows_of_parts(e: Experiment, values: Mapping[str, float], number: int, by_load: bool) -> list[np.ndarray]:
     """Rows of the parts of ``e``; parameters as in ``estimates_of_parts``; [] for a table that is too short."""
     unknowns = sum(not row.scatter for row in e.parameters) + e.misfit(e.local(values)).design.shape[1]
-    rows = informative_rows(e)
+    rows = np.arange(len(e.table.rows))
+    if e.time_series and e.n == len(rows):
+        # Most of the energy of a record lies before it is all noise.
+        rows = rows[: length_of_motion(e.observed)]
     number = min(number, len(rows) // max(ROWS_PER_UNKNOWN * unknowns, 3))
     if number < 2:
         return []
@@ -360,20 +356,6 @@ def rows_of_parts(e: Experiment, values: Mapping[str, float], number: int, by_lo
     if FEWEST_PARTS <= len(levels) <= MOST_PARTS:
         return [np.flatnonzero(index == level) for level in range(len(levels))]
     return np.array_split(np.argsort(e.loads[0], kind="stable"), number)
-
-
-def informative_rows(e: Experiment) -> np.ndarray:
-    """Indices of the rows of the table of ``e``; of a record those with most of its energy, before it is all noise."""
-    rows = np.arange(len(e.table.rows))
-    if not e.time_series or e.n != len(rows):
-        return rows
-    return rows[: length_of_motion(e.observed)]
-
-
-def rows_of(table: Table, rows: np.ndarray) -> Table:
-    """The table with some of its rows."""
-    columns = {name: replace(column, values=column.values[rows]) for name, column in table.columns.items()}
-    return replace(table, columns=columns, rows=table.rows[rows])
 
 
 # record widening: Error of the model in runs and decays, from the scores of parts of their records.
