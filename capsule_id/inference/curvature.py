@@ -35,11 +35,6 @@ def covariance(jacobian: Jacobian) -> Float[np.ndarray, "d d"]:
     return root @ root.T
 
 
-def all_finite(jacobian: Jacobian, residuals: Residuals) -> bool:
-    """Whether every entry of both is finite."""
-    return bool(np.isfinite(jacobian).all() and np.isfinite(residuals).all())
-
-
 def column_space(
     jacobian: Jacobian,
 ) -> tuple[
@@ -65,10 +60,6 @@ Matrix = Float[np.ndarray, "d d"]
 
 #: Steps of the differences in units of the scale given, and their ratio for Richardson extrapolation.
 STEP, RATIO = 0.05, 2.0
-#: Step of the gradient's central differences, in standard deviations. Its error is 3e-5 where the curvature changes
-#: by half over one standard deviation. A log-posterior of 500 readings of 4000 sds is rounded to 1e-6, which a step of
-#: 1e-3 made an error of 1e-3.
-GRADIENT_STEP = 2e-2
 #: Smallest sd of a parameter that can be sampled, in units in the last place of its value.
 FEWEST_UNITS = 1e3
 #: Rows of every batch. A fixed number needs one compilation only.
@@ -110,14 +101,6 @@ def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vect
     matrix = np.zeros((d, d))
     matrix[rows, columns] = best / (scale[rows] * scale[columns])
     return matrix + np.triu(matrix, 1).T
-
-
-def value_and_gradient(function: Callable[[np.ndarray], np.ndarray], v: Vector) -> tuple[float, Vector]:
-    """Value and (d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates with unit standard deviation."""
-    offsets = GRADIENT_STEP * np.eye(len(v))
-    values = function(np.concatenate([v[None], v + offsets, v - offsets]))
-    plus, minus = np.split(values[1:], 2)
-    return float(values[0]), (plus - minus) / (2.0 * GRADIENT_STEP)
 
 
 def jacobian(function: Callable[[np.ndarray], np.ndarray], u: Vector, step: Vector) -> Float[np.ndarray, "n d"]:

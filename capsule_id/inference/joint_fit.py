@@ -164,7 +164,11 @@ def joint_fit(
     first : values by name that replace those of ``known`` in the first starting point
     starts : (s, d) u of the starting points, instead of the best candidates
     """
-    starts = _choose_starts(target, known, seed, first or {}) if starts is None else starts
+    if starts is None:
+        # Another thread compiles the derivatives meanwhile; an error occurs again where they are used.
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(_compile_descent, target)
+            starts = choose_starts(target, known, seed, first or {})
     ends = _ends(target, starts)
     u, value = np.stack([end.u for end in ends]), np.array([end.value for end in ends])
     best = int(np.argmax(value))
@@ -221,15 +225,6 @@ def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
             limit = COST_RATIO_TO_ABANDON * float(best.fit.cost[0])
             ends += workers.map(partial(_search, target, limit=limit), own)
     return ends
-
-
-def _choose_starts(
-    target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float]
-) -> np.ndarray:
-    """``choose_starts``, while another thread compiles the derivatives; an error occurs again where they are used."""
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(_compile_descent, target)
-        return choose_starts(target, known, seed, first)
 
 
 def _compile_descent(target: LogPosterior) -> None:

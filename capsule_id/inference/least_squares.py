@@ -16,7 +16,6 @@ from capsule_id.console import stop_if_interrupted
 from capsule_id.inference.curvature import (
     Jacobian,
     Residuals,
-    all_finite,
     column_space,
     in_batches,
 )
@@ -122,7 +121,7 @@ def least_squares(linearise: Linearise, starts: np.ndarray, solver: Solver = SOL
 def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> tuple[np.ndarray, Residuals, Jacobian, bool]:
     """Where one start (d,) ended: x (d,), residuals (n,) and Jacobian (n, d) there, and whether it is no minimum."""
     residuals, jacobian = linearise(start)
-    if not all_finite(jacobian, residuals):
+    if not (np.isfinite(jacobian).all() and np.isfinite(residuals).all()):
         return start, residuals, jacobian, True
     scale, unit = _effects(jacobian, solver.damping) if solver.heavy else _scales(jacobian, start)
     method = optx.LevenbergMarquardt(rtol=solver.tolerance, atol=solver.tolerance, linear_solver=lx.QR())
@@ -138,7 +137,7 @@ def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> tuple[n
         at_trial, slopes = linearise(np.asarray(trial) * scale)
         with np.errstate(over="ignore", invalid="ignore"):
             known = _Known(at_trial / unit, slopes * scale / unit)
-        if not all_finite(known.jacobian, known.residuals):
+        if not (np.isfinite(known.jacobian).all() and np.isfinite(known.residuals).all()):
             # Infinite residuals make the solver reject the trial.
             known = _Known(np.full_like(at_trial, np.inf), np.zeros_like(slopes))
     x = np.asarray(v) * scale

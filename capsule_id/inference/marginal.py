@@ -220,12 +220,17 @@ class MarginalPosterior:
     centre, covariance : (dimension,), (dimension, dimension) Laplace approximation of u
     event_driven : for each block whether a motion of the capsule belongs to it
     normal_priors : (2, dimension) centre and width of the prior of u where it is normal; NaN elsewhere
+    theta, work : those of ``target``: constrained values, and time of an evaluation
+    can_be_emulated : whether there are motions to compute, and all of them are trials of a few numbers each
     scaled : ``LogPosterior.scaled``, indices among the located parameters
     kept : (2, scatters) block of each scatter and its place among the scatters of that block, see ``factors``
     """
 
     def __init__(self, target: LogPosterior, fit: PointFit) -> None:
         self.target, self.names, self._layout = target, target.names, _layout(target)
+        self.theta, self.work = target.theta, target.work
+        slow = [e for e in target.experiments if e.event_driven]
+        self.can_be_emulated = bool(slow) and all(isinstance(e, Progression) for e in slow)
         self._located, self._scatter = np.array(self._layout.located), np.array(self._layout.scatter, dtype=int)
         self._label = np.array(self._layout.block)
         self.dimension = len(self._located)
@@ -264,21 +269,6 @@ class MarginalPosterior:
         values = in_batches(one, v)
         # Scatters without located parameters in their block add a constant.
         return np.where(np.isfinite(values), values, -np.inf)[:, : len(self.blocks)]
-
-    def theta(self, u: np.ndarray) -> np.ndarray:
-        """(..., d) constrained values from the whole u (..., d)."""
-        return self.target.theta(u)
-
-    @property
-    def work(self) -> int:
-        """Time of an evaluation in units of that of one reading; 1 where it integrates motions of the capsule."""
-        return self.target.work
-
-    @property
-    def can_be_emulated(self) -> bool:
-        """Whether there are motions to compute, and all of them are trials of a few numbers each."""
-        slow = [e for e in self.target.experiments if e.event_driven]
-        return bool(slow) and all(isinstance(e, Progression) for e in slow)
 
     def motions(self, v: np.ndarray) -> list[np.ndarray]:
         """Motions of every experiment with trials at located u (w, dimension), (w, k) each."""

@@ -20,7 +20,6 @@ from capsule_id.inference.curvature import (
     hessian,
     in_batches,
     jacobian,
-    value_and_gradient,
 )
 from capsule_id.inference.least_squares import Solver, least_squares, linearised
 from capsule_id.inference.marginal import density_of
@@ -86,6 +85,10 @@ SAME_BASIN = 0.3
 #: Gradients per posterior standard deviation: quasi-Newton stops below the first, and its end counts as a maximum
 #: below the second. Rounding of the log-posterior may stop it in between.
 TOLERANCE, MAXIMUM = 1e-4, 1e-3
+#: Step of the gradient's central differences, in standard deviations. Its error is 3e-5 where the curvature changes
+#: by half over one standard deviation. A log-posterior of 500 readings of 4000 sds is rounded to 1e-6, which a step of
+#: 1e-3 made an error of 1e-3.
+GRADIENT_STEP = 2e-2
 #: Largest number of quasi-Newton steps.
 MAX_STEPS = 400
 #: Replaces a log-posterior that is not finite, because line searches need a finite number.
@@ -188,19 +191,16 @@ def _polish(
 ) -> tuple[np.ndarray, float, bool]:
     """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged."""
 
-    def negative(v: np.ndarray) -> np.ndarray:
-        """Negative log-posterior (m,) at whitened v (m, d)."""
-        value = in_batches(density, end + v @ whitening.T)
-        return -np.where(np.isfinite(value), value, LOG_POSTERIOR_FLOOR)
+    def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
+        """Negative log-posterior at whitened v (d,), and its gradient (d,): one batch for both, up to 15 parameters."""
+        offsets = GRADIENT_STEP * np.eye(len(v))
+        value = in_batches(density, end + np.concatenate([v[None], v + offsets, v - offsets]) @ whitening.T)
+        centre, *sides = np.split(-np.where(np.isfinite(value), value, LOG_POSTERIOR_FLOOR), [1, 1 + len(v)])
+        return float(centre[0]), (sides[0] - sides[1]) / (2.0 * GRADIENT_STEP)
 
     stop_if_interrupted()
-    solution = optimize.minimize(
-        lambda v: value_and_gradient(negative, v),  # one batch for both, up to 15 parameters
-        np.zeros(len(end)),
-        jac=True,
-        method="BFGS",
-        options={"gtol": TOLERANCE, "maxiter": MAX_STEPS},
-    )
+    options = {"gtol": TOLERANCE, "maxiter": MAX_STEPS}
+    solution = optimize.minimize(objective, np.zeros(len(end)), jac=True, method="BFGS", options=options)
     value = -float(solution.fun)
     return (
         end + whitening @ solution.x,

@@ -332,7 +332,14 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
         return SampledFit(target, fit, None, {**target.fixed, **fit.values}, seed=seed)
     alone = LogPosterior(target.rig, closed) if closed else None
     bench = None if alone is None else point_fit(alone, seed)
-    known = _paper_values(target, registry) if bench is None else dict(bench.values)
+    if bench is None:
+        # The paper's estimates from the rig's bench tests, including tests that ``target`` lacks.
+        tests = [e for e in target.experiments if e.bench]
+        if not tests and select_tables(target.rig, "bench"):
+            tests = make_experiments(target.rig, "bench", registry)
+        known = paper_estimates(tests, registry)
+    else:
+        known = dict(bench.values)
     target, findings = cut_unpredictable(target, known)
     # The joint fit takes one core most of the time: the bench is sampled on another one.
     with threads(1) as beside:
@@ -362,14 +369,6 @@ def _fit_with_right_starts(
     doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
     facts = {"labels": ", ".join(doubtful), "rounds": STAGE_ROUNDS}
     return target, joint, [Finding("runs.start", "fail", facts, doubtful[0])]
-
-
-def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:
-    """Return the paper's estimates from the rig's bench tests, including tests that ``target`` lacks."""
-    bench = [e for e in target.experiments if e.bench]
-    if not bench and select_tables(target.rig, "bench"):
-        bench = make_experiments(target.rig, "bench", registry)
-    return paper_estimates(bench, registry)
 
 
 def cut_unpredictable(target: LogPosterior, known: Mapping[str, float]) -> tuple[LogPosterior, list[Finding]]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import combinations, product
 
 import numpy as np
@@ -330,12 +329,15 @@ class Transported:
         z, ridge = self._z(s), SHRINKAGE * np.sum(weights**2)
         d = z.shape[1]
         # Columns: 1, the coordinates and their products, of which a coordinate uses those before it.
-        self._means, self._scales = np.zeros((1 + d + len(_pairs(d)[0]), d)), np.zeros((1 + d, d))
-        self._own = [np.flatnonzero(np.concatenate([[True], np.arange(d) < i, _pairs(d)[1] < i])) for i in range(d)]
+        self._means, self._scales = np.zeros((1 + d + len(np.triu_indices(d)[0]), d)), np.zeros((1 + d, d))
+        self._own = [
+            np.flatnonzero(np.concatenate([[True], np.arange(d) < i, np.triu_indices(d)[1] < i])) for i in range(d)
+        ]
         quadratic, linear = _quadratic(z), _linear(z)
         for i, own in enumerate(self._own):
             f, h = quadratic[:, own], linear[:, : 1 + i]
-            self._means[own, i] = _least_squares(f, z[:, i], weights, ridge)
+            weighted = f.T * weights
+            self._means[own, i] = np.linalg.solve(weighted @ f + ridge * np.eye(len(own)), weighted @ z[:, i])
             self._scales[: 1 + i, i] = _log_scale(h, z[:, i] - f @ self._means[own, i], weights, ridge)
         x, _ = self._x(u)
         self._mixture = Mixture(np.average(x, axis=0, weights=weights), np.atleast_2d(np.cov(x.T, aweights=weights)))
@@ -381,21 +383,9 @@ def _linear(z: Float[np.ndarray, "n i"]) -> Float[np.ndarray, "n k"]:
 
 def _quadratic(z: Float[np.ndarray, "n i"]) -> Float[np.ndarray, "n k"]:
     """1, the coordinates and their products of two."""
-    first, second = _pairs(z.shape[1])
+    first, second = np.triu_indices(z.shape[1])
     near = _linear(z)
     return np.column_stack([near, near[:, 1 + first] * near[:, 1 + second]])
-
-
-@cache
-def _pairs(number: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.triu_indices(number)
-
-
-def _least_squares(
-    f: Float[np.ndarray, "n k"], z: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], ridge: float
-) -> Float[np.ndarray, " k"]:
-    weighted = f.T * weights
-    return np.linalg.solve(weighted @ f + ridge * np.eye(f.shape[1]), weighted @ z)
 
 
 def _log_scale(

@@ -72,11 +72,9 @@ def smoothing_certificate(target: LogPosterior, fit: PointFit) -> ResultTable:
     """
     smooth = target.rig.model.engine == "smooth"
     engines = {"engine": "smoothed", "other": "exact"} if smooth else {"engine": "exact", "other": "smoothed"}
-    shift, sd = smoothing_shift(target, fit, None if smooth else Smoothing())
-    located = target.located
-    rows = {target.names[i]: [d, s, d / s] for i, d, s in zip(located, shift, sd, strict=True)}
+    named = zip(target.located, *smoothing_shift(target, fit, None if smooth else Smoothing()), strict=True)
+    rows = {target.names[i]: [d, s, d / s] for i, d, s in named if target.parameters[i].physical}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["shift of u", "sd of u", "shift / sd"])
-    frame = frame.loc[[name for name in frame.index if target.parameters[target.names.index(name)].physical]]
     return ResultTable("runs.smoothing", frame.rename_axis("parameter"), {**engines, **WIDTHS})
 
 
@@ -110,9 +108,8 @@ def check_engine(sampled: SampledFit) -> list[Finding]:
         bound = np.linalg.norm(_residuals(_by_engine(target, None), fit) - _residuals(target, fit))
         shifts = {row.name: float(bound) for e in moved for row in e.parameters if row.physical}
     else:
-        shift, sd = smoothing_shift(target, fit, None)
-        named = zip(target.located, np.abs(shift) / sd, strict=True)
-        shifts = {row.name: float(s) for row, s in ((target.parameters[i], s) for i, s in named) if row.physical}
+        named = zip(target.located, *smoothing_shift(target, fit, None), strict=True)
+        shifts = {target.names[i]: float(abs(d) / s) for i, d, s in named if target.parameters[i].physical}
     # A shift that is not finite fails.
     names = tuple(name for name, s in shifts.items() if not s <= SMALL_SHIFT)
     level = "ok" if not names else "warn" if all(s <= LARGE_SHIFT for s in shifts.values()) else "fail"
@@ -222,8 +219,7 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             entry |= {"mean": np.mean(draws), "median": median, "lower": lower, "upper": upper}
             entry |= {name: getattr(posterior, name)[i] for name in ("ess", "ess_bulk", "ess_tail", "rhat")}
         entry |= _widened(entry, sampled.widened.get(row.name), row.positive)
-        if row.positive and "lower" in entry and entry["lower"] * UPPER_LIMIT < entry["upper"]:
-            entry["lower"] = 0.0
+        entry |= _limited(entry) if row.positive else {}
         rows.append((row, {**entry, "quote": quote(entry, row.positive)}))
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
@@ -289,6 +285,11 @@ def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool
             moved = value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
             found |= {end: moved, f"{end}_unwidened": limit}
     return found
+
+
+def _limited(entry: Mapping[str, Any]) -> dict[str, object]:
+    """The lower end 0 where the readings give an upper limit alone."""
+    return {"lower": 0.0} if "lower" in entry and entry["lower"] * UPPER_LIMIT < entry["upper"] else {}
 
 
 def quote(entry: Mapping[str, Any], positive: bool) -> Literal["sd", "interval"]:
