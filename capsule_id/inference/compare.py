@@ -258,7 +258,7 @@ def compare_points(
     table = _table(
         {name: {**row, "difference": row["log_evidence"] - highest} for name, row in rows.items()}, "log_evidence"
     )
-    behind = {str(name): float(value) for name, value in table["difference"].items()}
+    behind = dict(zip(map(str, table.index), table["difference"].tolist(), strict=True))
     close = [name for name, difference in behind.items() if difference >= -STRONG]
     recommended = min(close, key=lambda name: rows[name]["parameters"])
     said = _recommendation(
