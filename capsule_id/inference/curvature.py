@@ -57,6 +57,11 @@ def column_space(
 #: d coordinates, and a matrix of them.
 Vector = Float[np.ndarray, " d"]
 Matrix = Float[np.ndarray, "d d"]
+#: Points, a row each; a number of each point.
+Points = Float[np.ndarray, "n d"]
+PerPoint = Float[np.ndarray, " n"]
+#: Random numbers of the sampler.
+Random = np.random.RandomState
 
 #: Steps of the differences in units of the scale given, and their ratio for Richardson extrapolation.
 STEP, RATIO = 0.05, 2.0

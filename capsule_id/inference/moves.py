@@ -16,6 +16,7 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from capsule_id.console import stop_if_interrupted
+from capsule_id.inference.curvature import Random
 from capsule_id.inference.proposal import BlockProposal
 from capsule_id.inference.target import Scale
 from capsule_id.output import replace_file
@@ -186,7 +187,7 @@ class BlockMove(emcee.moves.Move):
         after, accepted = self.step(_exact(model, self.blocks), before, model.random)
         return _state(state, after.coords, after.parts), np.mean(accepted, axis=1)
 
-    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+    def step(self, log_density: Parts, before: Walkers, random: Random) -> tuple[Walkers, np.ndarray]:
         """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
         proposal = self.proposal
         drawn = proposal.draw(random, len(before.coords))
@@ -216,7 +217,7 @@ class RandomWalk:
         parts = log_density(coords)
         return Walkers(coords, parts, np.zeros_like(parts))
 
-    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+    def step(self, log_density: Parts, before: Walkers, random: Random) -> tuple[Walkers, np.ndarray]:
         """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
         new = before.coords.copy()
         for block, root in zip(self.blocks, self._roots, strict=True):
@@ -246,7 +247,7 @@ class Rescaling:
         parts = log_density(coords)
         return Walkers(coords, parts, np.zeros_like(parts))
 
-    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+    def step(self, log_density: Parts, before: Walkers, random: Random) -> tuple[Walkers, np.ndarray]:
         """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
         new, factors = before.coords.copy(), np.zeros_like(before.proposed)
         rescales = random.uniform() < 0.5
@@ -295,7 +296,7 @@ class DelayedMove(emcee.moves.Move):
 
 
 def accept(
-    random: np.random.RandomState,
+    random: Random,
     before: Walkers,
     new: np.ndarray,
     new_parts: np.ndarray,
@@ -431,7 +432,7 @@ class Ensemble:
         return self
 
 
-def initial_state(positions: np.ndarray, random: np.random.RandomState) -> emcee.State:
+def initial_state(positions: np.ndarray, random: Random) -> emcee.State:
     """State of walkers at ``positions`` (w, d), with the current state of ``random``."""
     return emcee.State(positions, random_state=random.get_state())
 

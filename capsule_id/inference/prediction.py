@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 from scipy import stats
 
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.inference.curvature import PerPoint, Random
 from capsule_id.inference.marginal import MarginalPosterior, trials_of
 from capsule_id.inference.proposal import BlockProposal, effective_size
 from capsule_id.inference.result import PointFit, Result
@@ -115,7 +115,7 @@ LARGEST_SHAPE = 0.7
 FEWEST_IN_TAIL = 5
 
 
-def log_evidence(log_weight: Float[np.ndarray, " m"], rng: np.random.Generator) -> tuple[float, float]:
+def log_evidence(log_weight: PerPoint, rng: np.random.Generator) -> tuple[float, float]:
     """Log of the mean weight of independent draws of a proposal, and its standard error.
 
     The posterior sample is an independence Metropolis–Hastings chain over the draws of one part.
@@ -135,7 +135,7 @@ def log_evidence(log_weight: Float[np.ndarray, " m"], rng: np.random.Generator) 
     return float(np.mean(found)), float(np.std(found, ddof=1) / np.sqrt(PARTS))
 
 
-def _posterior_sample(log_weight: Float[np.ndarray, " m"], rng: np.random.Generator) -> Float[np.ndarray, " m"]:
+def _posterior_sample(log_weight: PerPoint, rng: np.random.Generator) -> PerPoint:
     """Log-weights along a chain that is offered the draws inside the posterior in their order."""
     offers = log_weight[np.isfinite(log_weight)]
     state, chain = offers[0], np.empty_like(offers)
@@ -145,7 +145,7 @@ def _posterior_sample(log_weight: Float[np.ndarray, " m"], rng: np.random.Genera
     return chain
 
 
-def _bridge(posterior: Float[np.ndarray, " n"], proposal: Float[np.ndarray, " m"]) -> float:
+def _bridge(posterior: PerPoint, proposal: PerPoint) -> float:
     """Log-evidence from log-weights at draws of the posterior and of the proposal."""
     size = effective_size(proposal)
     first, second = np.log([size, len(proposal)]) - np.log(size + len(proposal))
@@ -157,13 +157,11 @@ def _bridge(posterior: Float[np.ndarray, " n"], proposal: Float[np.ndarray, " m"
     return found
 
 
-def _log_mean(logarithm: Float[np.ndarray, " m"]) -> float:
+def _log_mean(logarithm: PerPoint) -> float:
     return float(np.logaddexp.reduce(logarithm) - np.log(len(logarithm)))
 
 
-def smoothed_weights(
-    log_weight: Float[np.ndarray, " m"], relative: float = 1.0
-) -> tuple[Float[np.ndarray, " m"], float]:
+def smoothed_weights(log_weight: PerPoint, relative: float = 1.0) -> tuple[PerPoint, float]:
     """Normalised log-weights with a smoothed upper tail, and the Pareto shape of that tail; inf where it has no tail.
 
     Parameters
@@ -183,7 +181,7 @@ def smoothed_weights(
     return x - np.logaddexp.reduce(x), float(shape)
 
 
-def _pareto(x: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _pareto(x: PerPoint) -> tuple[float, float]:
     """Shape and scale of a generalised Pareto distribution from its ascending sample, the shape drawn towards 0.5."""
     n = len(x)
     count = 30 + int(np.sqrt(n))
@@ -235,7 +233,7 @@ class WeightedDraws:
     inside: np.ndarray
     values: list[dict[str, float]]
 
-    def of(self, e: Progression) -> Float[np.ndarray, " m"]:
+    def of(self, e: Progression) -> PerPoint:
         """Log-weights of the block that ``e`` depends on."""
         return self.log_weight[
             self.inside, next(self.block[row.name] for row in e.parameters if row.name in self.block)
@@ -292,7 +290,7 @@ def weighted_draws(
     return WeightedDraws(target, fit, drawn_from, log_weight, log_normalisation, label, inside, values)
 
 
-def _known_draws(proposal: BlockProposal, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+def _known_draws(proposal: BlockProposal, random: Random) -> tuple[np.ndarray, np.ndarray]:
     """Draws (w, d) and their log-densities (w, blocks); +inf where a block has overflowed, at another place."""
     v = proposal.draw(random, PROPOSED_DRAWS)
     known = np.stack([np.all(np.isfinite(v[:, block]), axis=1) for block in proposal.blocks], axis=1)
@@ -300,7 +298,7 @@ def _known_draws(proposal: BlockProposal, random: np.random.RandomState) -> tupl
     return v, np.where(known, proposal.log_density(v), np.inf)
 
 
-def _log_normalisation(emulated: Emulation, random: np.random.RandomState) -> np.ndarray:
+def _log_normalisation(emulated: Emulation, random: Random) -> np.ndarray:
     """(2, blocks) log-evidence of an emulated posterior and its standard error."""
     v, density = _known_draws(emulated.proposal, random)
     rng = np.random.default_rng(random.randint(2**31))

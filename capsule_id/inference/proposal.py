@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import gammaln, log_ndtr, ndtr, ndtri
 
-from capsule_id.inference.curvature import Matrix, Vector
+from capsule_id.inference.curvature import Matrix, PerPoint, Points, Random, Vector
 
 # coordinates: Coordinates w of the proposals of a block of parameters, and the priors of terms that may be absent.
 #
@@ -49,32 +49,32 @@ class Coordinates:
     upper: Vector
     shear: Matrix
 
-    def w(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    def w(self, u: Points) -> Points:
         return np.where(self.linear, np.exp(np.where(self.linear, u, 0.0)), u) - self._weak_part(u)
 
-    def u(self, w: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    def u(self, w: Points) -> Points:
         """NaN where theta is not positive."""
         w = w + self._weak_part(self._unsheared(w))
         return self._unsheared(w)
 
-    def _unsheared(self, w: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    def _unsheared(self, w: Points) -> Points:
         """u of coordinates without the part of the weak parameters; that of a weak parameter is 0."""
         positive = self.linear & (w > 0.0)
         logarithm = np.where(positive, np.log(np.where(positive, w, 1.0)), np.nan)
         return np.where(self.linear, logarithm, w)
 
-    def _weak_part(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    def _weak_part(self, u: Points) -> Points:
         """Part of each parameter that changes with the theta of the weak ones; constant above ``upper``."""
         weak = list(self.weak)
         return np.exp(np.minimum(u, self.upper)[:, weak]) @ self.shear[:, weak].T
 
-    def prior_density(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    def prior_density(self, u: Points) -> Points:
         """Log-densities of the priors, which end at ``upper``."""
         z, highest = (u - self.centre) / self.width, (self.upper - self.centre) / self.width
         density = -0.5 * z**2 - np.log(self.width * np.sqrt(2.0 * np.pi)) - log_ndtr(highest)
         return np.where(z <= highest, density, -np.inf)
 
-    def draw_prior(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]:
+    def draw_prior(self, rng: Random, size: int) -> Points:
         """u of every parameter from its prior."""
         share = ndtr((self.upper - self.centre) / self.width)
         return self.centre + self.width * ndtri(rng.uniform(size=(size, len(self.centre))) * share)
@@ -86,7 +86,7 @@ def logarithmic(dimension: int) -> Coordinates:
     return Coordinates(np.zeros(dimension, dtype=bool), (), zero, zero + 1.0, zero, np.zeros((dimension, dimension)))
 
 
-def coordinates_of(sample: Float[np.ndarray, "n d"], prior: Float[np.ndarray, "2 d"]) -> Coordinates:
+def coordinates_of(sample: Points, prior: Float[np.ndarray, "2 d"]) -> Coordinates:
     """Coordinates in which a ``sample`` of u is closest to normal: largest likelihood of a normal density (Box & Cox).
 
     Parameters
@@ -179,7 +179,7 @@ class Mixture:
         constant = gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom) - 0.5 * d * np.log(np.pi * freedom)
         self._power, self._constant = 0.5 * (freedom + d), np.log(self.weights) + constant - size
 
-    def components(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k n"]:
+    def components(self, u: Points) -> Float[np.ndarray, "k n"]:
         """Log-densities of u under the components, weights included."""
         off = np.broadcast_to(self._coordinates.w(u) - self._centre, (len(self.weights), *u.shape))
         left = np.where(self.drawn[:, None], 0.0, off - off @ self._slopes.transpose(0, 2, 1))
@@ -190,10 +190,10 @@ class Mixture:
         prior = np.sum(np.where(self.drawn[:, None], self._coordinates.prior_density(u), 0.0), axis=2)
         return student + jacobian + prior
 
-    def log_density(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    def log_density(self, u: Points) -> PerPoint:
         return np.logaddexp.reduce(self.components(u), axis=0)
 
-    def draw(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]:
+    def draw(self, rng: Random, size: int) -> Points:
         """Draw u; NaN where theta is not positive."""
         k = rng.choice(len(self.weights), size=size, p=self.weights)
         scale = np.sqrt(self._freedom / rng.chisquare(self._freedom, size))
@@ -230,12 +230,12 @@ class BlockProposal:
     blocks: Sequence[np.ndarray]
     densities: "Sequence[Mixture | Transported]"
 
-    def log_density(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n blocks"]:
+    def log_density(self, u: Points) -> Float[np.ndarray, "n blocks"]:
         """Log-density of the parameters of each block."""
         pairs = zip(self.blocks, self.densities, strict=True)
         return np.stack([density.log_density(u[:, block]) for block, density in pairs], axis=1)
 
-    def draw(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]:
+    def draw(self, rng: Random, size: int) -> Points:
         """Draw u; NaN for a parameter in theta that is not positive."""
         u = np.empty((size, sum(map(len, self.blocks))))
         for block, density in zip(self.blocks, self.densities, strict=True):
@@ -288,7 +288,7 @@ class Scores:
     u, weights : (n, d) draws and their normalised weights
     """
 
-    def __init__(self, u: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> None:
+    def __init__(self, u: Points, weights: PerPoint) -> None:
         share = min(SMOOTHED * float(np.sum(weights**2)), 1.0)
         score = np.linspace(-OUTER, OUTER, KNOTS)
         quantiles = np.stack([np.quantile(x, ndtr(score), weights=weights, method="inverted_cdf") for x in u.T])
@@ -301,12 +301,12 @@ class Scores:
         ends = np.array([-(1.0 + FAR) * OUTER, (1.0 + FAR) * OUTER])
         self._score = np.broadcast_to(np.concatenate([ends[:1], score, ends[1:]]), self._knots.shape)
 
-    def scores(self, u: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
+    def scores(self, u: Points) -> tuple[Points, PerPoint]:
         """Scores, and the log of their Jacobian."""
         found, slope = _straight(u, self._knots, self._score)
         return found, np.sum(np.log(slope), axis=1)
 
-    def u(self, scores: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    def u(self, scores: Points) -> Points:
         return _straight(scores, self._score, self._knots)[0]
 
 
@@ -321,7 +321,7 @@ class Transported:
     u, weights : (n, d) draws and their normalised weights, which determine the map
     """
 
-    def __init__(self, u: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> None:
+    def __init__(self, u: Points, weights: PerPoint) -> None:
         self._scores = Scores(u, weights)
         s, _ = self._scores.scores(u)
         self._mean, covariance = np.average(s, axis=0, weights=weights), np.atleast_2d(np.cov(s.T, aweights=weights))
@@ -342,10 +342,10 @@ class Transported:
         x, _ = self._x(u)
         self._mixture = Mixture(np.average(x, axis=0, weights=weights), np.atleast_2d(np.cov(x.T, aweights=weights)))
 
-    def _z(self, s: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    def _z(self, s: Points) -> Points:
         return np.linalg.solve(self._root, (s - self._mean).T).T
 
-    def _x(self, u: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
+    def _x(self, u: Points) -> tuple[Points, PerPoint]:
         """Coordinates x, and log |dx/du|."""
         s, logarithm = self._scores.scores(u)
         z = self._z(s)
@@ -353,11 +353,11 @@ class Transported:
         x = (z - _quadratic(z) @ self._means) * np.exp(-size)
         return x, logarithm - np.sum(np.log(np.diag(self._root))) - np.sum(size, axis=1)
 
-    def log_density(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    def log_density(self, u: Points) -> PerPoint:
         x, logarithm = self._x(u)
         return self._mixture.log_density(x) + logarithm
 
-    def draw(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]:
+    def draw(self, rng: Random, size: int) -> Points:
         x = self._mixture.draw(rng, size)
         z = np.empty_like(x)
         for i, own in enumerate(self._own):
@@ -366,9 +366,7 @@ class Transported:
         return self._scores.u(self._mean + z @ self._root.T)
 
 
-def _straight(
-    x: Float[np.ndarray, "n d"], knots: Float[np.ndarray, "d k"], values: Float[np.ndarray, "d k"]
-) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+def _straight(x: Points, knots: Float[np.ndarray, "d k"], values: Float[np.ndarray, "d k"]) -> tuple[Points, Points]:
     """Piecewise linear function of each coordinate that has ``values`` at ``knots``, and its slope; straight beyond them."""
     i = np.sum(x[:, :, None] > knots[None, :, 1:-1], axis=2)
     j = np.arange(x.shape[1])[None]
@@ -389,7 +387,7 @@ def _quadratic(z: Float[np.ndarray, "n i"]) -> Float[np.ndarray, "n k"]:
 
 
 def _log_scale(
-    h: Float[np.ndarray, "n k"], residuals: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], ridge: float
+    h: Float[np.ndarray, "n k"], residuals: PerPoint, weights: PerPoint, ridge: float
 ) -> Float[np.ndarray, " k"]:
     """Coefficients of the logarithm of the sd of ``residuals``: largest likelihood of normal residuals."""
     found = np.zeros(h.shape[1])
@@ -437,7 +435,7 @@ class _Rounds:
         self._u = np.empty((0, prior.shape[1]))
         self._log_posterior = self._log_drawn = np.empty(0)
 
-    def add(self, u: Float[np.ndarray, "n d"], log_posterior: Float[np.ndarray, " n"]) -> float:
+    def add(self, u: Points, log_posterior: PerPoint) -> float:
         """Add the draws of the newest proposal; return their effective sample size.
 
         Raises
@@ -457,18 +455,18 @@ class _Rounds:
         return effective_size(log_posterior - densities[-1])
 
     @property
-    def log_weights(self) -> Float[np.ndarray, " n"]:
+    def log_weights(self) -> PerPoint:
         """Logarithms of the weights of the draws of all rounds, without a common constant."""
         return self._log_posterior - self._log_drawn
 
-    def next(self, good: bool, rng: np.random.RandomState) -> None:
+    def next(self, good: bool, rng: Random) -> None:
         """Add the proposal of the next round: the same where it is ``good``, else that which all draws determine.
 
         It also stays where few draws have a density: those of more rounds together determine the next one.
         """
         self.proposals.append(self.proposals[-1] if good else self._adapted(rng))
 
-    def _adapted(self, rng: np.random.RandomState) -> Mixture | Transported:
+    def _adapted(self, rng: Random) -> Mixture | Transported:
         weights = tempered(self.log_weights, LEAST_SIZE * self._u.shape[1])
         used = weights > 0.0  # the theta of the others may overflow
         u, weights = self._u[used], weights[used]
@@ -486,7 +484,7 @@ def refined(
     parts: Callable[[np.ndarray], np.ndarray],
     first: BlockProposal,
     prior: Float[np.ndarray, "2 d"],
-    rng: np.random.RandomState,
+    rng: Random,
     large: Sequence[bool],
     rounds: int | None = None,
 ) -> BlockProposal:
@@ -535,13 +533,13 @@ def affordable_rounds(evaluations: float) -> int:
     return int(np.clip(evaluations / DRAWS, SINGLE + FEWER, ROUNDS))
 
 
-def effective_size(log_weights: Float[np.ndarray, " w"]) -> float:
+def effective_size(log_weights: PerPoint) -> float:
     """Effective sample size of weights, 1/sum of their squares where their sum is 1."""
     weights = np.exp(log_weights - np.max(log_weights))
     return float(np.sum(weights) ** 2 / np.sum(weights**2))
 
 
-def tempered(log_weights: Float[np.ndarray, " w"], least: float) -> Float[np.ndarray, " w"]:
+def tempered(log_weights: PerPoint, least: float) -> PerPoint:
     """Normalised weights to the largest power of ``TEMPERS`` whose effective sample size is at least ``least``.
 
     Where there is none, the largest weights count alike and the others not at all (Koblents & Míguez 2015).

@@ -15,6 +15,7 @@ import numpy as np
 from emcee import State
 
 from capsule_id.console import OnProgress
+from capsule_id.inference.curvature import Random
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.moves import (
     ChainStore,
@@ -75,7 +76,7 @@ class Places(NamedTuple):
 
     v: np.ndarray
 
-    def draw(self, random: np.random.RandomState, size: int) -> np.ndarray:
+    def draw(self, random: Random, size: int) -> np.ndarray:
         """(size, d)"""
         return self.v[random.choice(len(self.v), size, replace=size > len(self.v))]
 
@@ -100,7 +101,7 @@ class Emulation(NamedTuple):
     proposal: BlockProposal
     start: Places
 
-    def draw(self, number: int, random: np.random.RandomState) -> np.ndarray:
+    def draw(self, number: int, random: Random) -> np.ndarray:
         """``number`` draws (w, d) of the emulated posterior, by chains that go on from ``start``."""
         found = [self.start.v]
         while sum(map(len, found)) < number:
@@ -112,7 +113,7 @@ def emulation(
     target: MarginalPosterior,
     first: BlockProposal,
     large: list[bool],
-    random: np.random.RandomState,
+    random: Random,
     known: ExactMotions | None = None,
 ) -> Emulation:
     """Emulate ``target``.
@@ -155,7 +156,7 @@ def emulation(
 
 
 def corrected(
-    target: MarginalPosterior, before: Emulation, walkers: np.ndarray, large: list[bool], random: np.random.RandomState
+    target: MarginalPosterior, before: Emulation, walkers: np.ndarray, large: list[bool], random: Random
 ) -> Emulation:
     """Emulate ``target`` with further exact motions about ``walkers`` (w, d) of delayed acceptance by ``before``.
 
@@ -176,7 +177,7 @@ def _adapted(
     proposal: BlockProposal,
     v: np.ndarray,
     large: list[bool],
-    random: np.random.RandomState,
+    random: Random,
 ) -> Emulation:
     """Emulator of ``known``, its proposal with maps of the large blocks, and the last places of a chain from v (w, d).
 
@@ -194,7 +195,7 @@ def _adapted(
     return Emulation(emulated, known, proposal, Places(v))
 
 
-def _finite(density: BlockProposal | Places, random: np.random.RandomState, size: int) -> np.ndarray:
+def _finite(density: BlockProposal | Places, random: Random, size: int) -> np.ndarray:
     """Those of ``size`` draws (size, d) that are finite."""
     v = density.draw(random, size)
     return v[np.all(np.isfinite(v), axis=1)]
@@ -208,20 +209,18 @@ def _inside(target: MarginalPosterior, v: np.ndarray) -> np.ndarray:
     return v
 
 
-def _chain(target: MarginalPosterior, v: np.ndarray, moves: Moves, random: np.random.RandomState) -> Ensemble:
+def _chain(target: MarginalPosterior, v: np.ndarray, moves: Moves, random: Random) -> Ensemble:
     """Walkers at v (w, d). Each chain gets random numbers of its own: chains with the same ones come together."""
     own = np.random.RandomState(random.randint(2**32, dtype=np.uint64))
     return Ensemble(target.parts, initial_state(v, own), moves)
 
 
-def _walked(
-    target: MarginalPosterior, v: np.ndarray, moves: Moves, random: np.random.RandomState, steps: int = STEPS
-) -> np.ndarray:
+def _walked(target: MarginalPosterior, v: np.ndarray, moves: Moves, random: Random, steps: int = STEPS) -> np.ndarray:
     """Last places (w, d) of walkers from v (w, d)."""
     return _chain(target, v, moves, random).run(steps, store=False).state.coords
 
 
-def _around(v: np.ndarray, random: np.random.RandomState) -> np.ndarray:
+def _around(v: np.ndarray, random: Random) -> np.ndarray:
     """Draws v (w, d) with normal noise: the emulator needs motions around the posterior too, not only inside it."""
     return v + NOISE * random.multivariate_normal(np.zeros(v.shape[1]), np.atleast_2d(np.cov(v.T)), len(v))
 
@@ -388,7 +387,7 @@ def pilot(target: MarginalPosterior, seed: int) -> Schedule:
     return Schedule(proposal, FIRST, moves, walkers.run(PILOT_STEPS))
 
 
-def _emulated(target: MarginalPosterior, random: np.random.RandomState) -> Schedule:
+def _emulated(target: MarginalPosterior, random: Random) -> Schedule:
     """Moves of delayed acceptance by an emulated posterior.
 
     A long autocorrelation time may mean that walkers stay where the emulator is wrong: it learns the motions there. The
@@ -412,9 +411,7 @@ def _delayed(target: MarginalPosterior, found: Emulation, state: State) -> Sched
     return Schedule(found.start, DELAYED, moves, Ensemble(target.parts, state, moves).run(PILOT_STEPS))
 
 
-def adapted_proposal(
-    target: MarginalPosterior, random: np.random.RandomState, first: BlockProposal | None = None
-) -> BlockProposal:
+def adapted_proposal(target: MarginalPosterior, random: Random, first: BlockProposal | None = None) -> BlockProposal:
     """Proposal adapted to the density of ``target``, from the Laplace approximation.
 
     A proposal ``first`` that is adapted to a similar density takes its place, and needs ``NEAR`` rounds only.
@@ -478,7 +475,7 @@ def _sampler(target: MarginalPosterior, schedule: Schedule, seed: int, backend: 
     return Ensemble(target.factors, burnt_in, schedule.moves, backend)
 
 
-def _initial(target: MarginalPosterior, density: BlockProposal | Places, random: np.random.RandomState) -> State:
+def _initial(target: MarginalPosterior, density: BlockProposal | Places, random: Random) -> State:
     """Walkers drawn from ``density``, each at a finite log-posterior."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
     u = np.empty((0, target.dimension))
