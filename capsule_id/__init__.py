@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     __version__: str
     from capsule_id.api import Fit as Fit, compare as compare, fit as fit, load as load, read_rig as read_rig
     from capsule_id.errors import InputError as InputError
-    from capsule_id.experiments.progression.twin import RobotDesign as RobotDesign, synthesize_robot as synthesize_robot
     from capsule_id.importing import propose_entry as propose_entry
     from capsule_id.inference.compare import compare_models as compare_models, compare_points as compare_points
     from capsule_id.motions.operating import draws_diagram as draws_diagram
@@ -68,13 +67,16 @@ if TYPE_CHECKING:
     )
     from capsule_id.physics.simulation import simulate as simulate, smoothing_bias as smoothing_bias
     from capsule_id.physics.smooth.engine import Smoothing as Smoothing
-    from capsule_id.synthetic import synthesize as synthesize
+    from capsule_id.synthetic import (
+        RobotDesign as RobotDesign,
+        synthesize as synthesize,
+        synthesize_robot as synthesize_robot,
+    )
 
 #: The same names by module, where they are imported at their first use.
 _PUBLIC = {
     "api": ("Fit", "compare", "fit", "load", "read_rig"),
     "errors": ("InputError",),
-    "experiments.progression.twin": ("RobotDesign", "synthesize_robot"),
     "importing": ("propose_entry",),
     "inference.compare": ("compare_models", "compare_points"),
     "motions.operating": ("draws_diagram",),
@@ -86,7 +88,7 @@ _PUBLIC = {
     "physics.model": ("CapsuleParameters", "Status", "Trajectory", "status_message"),
     "physics.simulation": ("simulate", "smoothing_bias"),
     "physics.smooth.engine": ("Smoothing",),
-    "synthetic": ("synthesize",),
+    "synthetic": ("RobotDesign", "synthesize", "synthesize_robot"),
 }
 _MODULE_OF = {name: f"capsule_id.{module}" for module, names in _PUBLIC.items() for name in names}
 __all__ = sorted(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]  (the imports above declare the names)

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _robot(args: argparse.Namespace) -> int:
     """Write the folder of a capsule robot; 0."""
-    from capsule_id.experiments.progression.twin import ROBOT, synthesize_robot
+    from capsule_id.synthetic import ROBOT, synthesize_robot
 
     values = dict(_assignment(text) for text in args.set)
     if unknown := sorted(set(values) - set(ROBOT)):

@@ -13,7 +13,9 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.joint_fit import joint_fit
-from capsule_id.inference.leave_out import (
+from capsule_id.inference.marginal import trials_of
+from capsule_id.inference.pipeline import check_readings, second_models
+from capsule_id.inference.prediction import (
     LARGEST_SHAPE,
     LeftOut,
     WeightedDraws,
@@ -24,8 +26,6 @@ from capsule_id.inference.leave_out import (
     predictions_text,
     weighted_draws,
 )
-from capsule_id.inference.marginal import trials_of
-from capsule_id.inference.pipeline import check_readings, second_models
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
 from capsule_id.views import counted
@@ -110,7 +110,7 @@ class Choice:
     recommended : the variant with the fewest parameters within ``STANDARD_ERRORS`` of the best, of point fits within
         ``STRONG``
     line : the recommendation in words, with the lines of ``[model]``, and what is uncertain
-    predictions : of the recommended variant, see ``capsule_id.inference.leave_out.left_out_predictions``; None for point
+    predictions : of the recommended variant, see ``capsule_id.inference.prediction.left_out_predictions``; None for point
         fits
     """
 
@@ -214,8 +214,10 @@ def compare_models(
     for number, name in enumerate(sorted(fitted, key=lambda name: -fitted[name].elpd)):
         if progress:
             progress(len(choices) + number, 2 * len(choices), name)
-        if not _hopeless(fitted[name].shape, *_difference(fitted[name], _best(fitted))):
-            fitted[name] = fitted[name].refitted(seed)
+        difference, error = _difference(fitted[name], _best(fitted))
+        # Weights with a large shape mostly overrate a variant; an infinite one hides the density of a setting.
+        hopeless = np.isfinite(fitted[name].shape) and difference < -(HOPELESS + HOPELESS_ERRORS * error)
+        fitted[name] = fitted[name] if hopeless else fitted[name].refitted(seed)
     return _choose(fitted, choices, seed)
 
 
@@ -256,7 +258,7 @@ def compare_points(
     table = _table(
         {name: {**row, "difference": row["log_evidence"] - highest} for name, row in rows.items()}, "log_evidence"
     )
-    behind = {str(name): float(rows[str(name)]["log_evidence"] - highest) for name in table.index}
+    behind = dict(zip(map(str, table.index), table["difference"].tolist(), strict=True))
     close = [name for name, difference in behind.items() if difference >= -STRONG]
     recommended = min(close, key=lambda name: rows[name]["parameters"])
     said = _recommendation(
@@ -315,14 +317,6 @@ def _difference(one: _Variant, best: _Variant) -> tuple[float, float]:
     with np.errstate(invalid="ignore"):
         each = one.density - best.density
         return float(np.sum(each)), float(np.sqrt(len(each) * np.var(each, ddof=1)))
-
-
-def _hopeless(shape: float, difference: float, error: float) -> bool:
-    """Whether a variant is too far behind for refits. Weights with a large shape mostly overrate a variant.
-
-    Where the shape is infinite, the density of a setting is unknown and a refit is needed.
-    """
-    return bool(np.isfinite(shape)) and difference < -(HOPELESS + HOPELESS_ERRORS * error)
 
 
 def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices], seed: int) -> Choice:

@@ -1,7 +1,6 @@
 """Curvature at the maximum: covariance from a Jacobian, gradient and Hessian by central differences."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -18,50 +17,22 @@ Jacobian = Float[np.ndarray, "n d"]
 Residuals = Float[np.ndarray, " n"]
 
 
-@dataclass(frozen=True)
-class Covariance:
-    """Covariance of the parameters at a minimum, and the rank of their Jacobian.
+def covariance(jacobian: Jacobian) -> Float[np.ndarray, "d d"]:
+    """(JᵀJ)⁻¹ of standardised residuals from the singular values of J (n, d), units of the parameters.
 
-    Attributes
-    ----------
-    matrix : (d, d), units of the parameters; every entry is inf where the Jacobian is rank deficient
-    rank : numerical rank of the Jacobian, its columns scaled to unit length; 0 where it is not finite
-    """
-
-    matrix: np.ndarray
-    rank: int
-
-    @property
-    def rank_deficient(self) -> bool:
-        """Whether some combination of the parameters leaves the residuals unchanged: no standard error exists."""
-        return self.rank < self.matrix.shape[0]
-
-    @property
-    def standard_errors(self) -> np.ndarray:
-        """(d,) square roots of the diagonal, units of the parameters; inf where rank deficient."""
-        return np.sqrt(np.diag(self.matrix))
-
-
-def covariance(jacobian: Jacobian) -> Covariance:
-    """(JᵀJ)⁻¹ of standardised residuals from the singular values of J (n, d), infinite where J is rank deficient.
-
-    A pseudo-inverse would give a direction without data zero variance.
+    Every entry is inf where J is not finite, or where some combination of the parameters leaves the residuals unchanged:
+    no standard error exists, and a pseudo-inverse would give a direction without data zero variance.
 
     The columns are scaled to unit length first, so that the rank does not depend on the units of the parameters.
     """
     no_answer = np.full((jacobian.shape[1], jacobian.shape[1]), np.inf)
     if not np.isfinite(jacobian).all():
-        return Covariance(no_answer, 0)
+        return no_answer
     _, singular, right, column_norm = column_space(jacobian)
     if len(singular) < jacobian.shape[1]:
-        return Covariance(no_answer, len(singular))
+        return no_answer
     root = right.T / singular / column_norm[:, None]
-    return Covariance(root @ root.T, len(singular))
-
-
-def all_finite(jacobian: Jacobian, residuals: Residuals) -> bool:
-    """Whether every entry of both is finite."""
-    return bool(np.isfinite(jacobian).all() and np.isfinite(residuals).all())
+    return root @ root.T
 
 
 def column_space(
@@ -86,13 +57,14 @@ def column_space(
 #: d coordinates, and a matrix of them.
 Vector = Float[np.ndarray, " d"]
 Matrix = Float[np.ndarray, "d d"]
+#: Points, a row each; a number of each point.
+Points = Float[np.ndarray, "n d"]
+PerPoint = Float[np.ndarray, " n"]
+#: Random numbers of the sampler.
+Random = np.random.RandomState
 
 #: Steps of the differences in units of the scale given, and their ratio for Richardson extrapolation.
 STEP, RATIO = 0.05, 2.0
-#: Step of the gradient's central differences, in standard deviations. Its error is 3e-5 where the curvature changes
-#: by half over one standard deviation. A log-posterior of 500 readings of 4000 sds is rounded to 1e-6, which a step of
-#: 1e-3 made an error of 1e-3.
-GRADIENT_STEP = 2e-2
 #: Smallest sd of a parameter that can be sampled, in units in the last place of its value.
 FEWEST_UNITS = 1e3
 #: Rows of every batch. A fixed number needs one compilation only.
@@ -134,14 +106,6 @@ def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vect
     matrix = np.zeros((d, d))
     matrix[rows, columns] = best / (scale[rows] * scale[columns])
     return matrix + np.triu(matrix, 1).T
-
-
-def value_and_gradient(function: Callable[[np.ndarray], np.ndarray], v: Vector) -> tuple[float, Vector]:
-    """Value and (d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates with unit standard deviation."""
-    offsets = GRADIENT_STEP * np.eye(len(v))
-    values = function(np.concatenate([v[None], v + offsets, v - offsets]))
-    plus, minus = np.split(values[1:], 2)
-    return float(values[0]), (plus - minus) / (2.0 * GRADIENT_STEP)
 
 
 def jacobian(function: Callable[[np.ndarray], np.ndarray], u: Vector, step: Vector) -> Float[np.ndarray, "n d"]:

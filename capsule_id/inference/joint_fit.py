@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
@@ -19,7 +19,7 @@ from capsule_id.inference.least_squares import LeastSquaresFit, Solver, least_sq
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.point_fit import AGREEMENT, described, dispersed_starts
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.views import counted
 
 # joint starts: Starting points of the joint fit: the bench estimates and the best of many candidates around them.
@@ -64,7 +64,7 @@ def choose_starts(
     # Copies of the centre would agree with it without a proof.
     candidates = np.concatenate([centre[None], candidates[np.any(candidates != centre, axis=1)]])
     value = weigh(target, candidates)
-    if any(e.has_joint_scatters for e in target.experiments):
+    if target.kinked:
         candidates[1:], value[1:] = _descended(target, candidates[1:], value[1:])
     ranked = 1 + np.argsort(-value[1:])[: MAX_STARTS - 1]
     ranked = ranked[np.isfinite(value[ranked])]
@@ -164,7 +164,11 @@ def joint_fit(
     first : values by name that replace those of ``known`` in the first starting point
     starts : (s, d) u of the starting points, instead of the best candidates
     """
-    starts = _choose_starts(target, known, seed, first or {}) if starts is None else starts
+    if starts is None:
+        # Another thread compiles the derivatives meanwhile; an error occurs again where they are used.
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(_compile_descent, target)
+            starts = choose_starts(target, known, seed, first or {})
     ends = _ends(target, starts)
     u, value = np.stack([end.u for end in ends]), np.array([end.value for end in ends])
     best = int(np.argmax(value))
@@ -172,9 +176,8 @@ def joint_fit(
         raise _not_finite(target, ends[best].fit, len(starts))
     fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
-    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0]).matrix
-    scatters = np.flatnonzero(target.scatter)
-    matrix[scatters, scatters] = _scatter_variances(target, u[best])
+    matrix[np.ix_(located, located)] = covariance(fit.jacobian[0])
+    matrix[np.diag_indices_from(matrix)] += _scatter_variances(target, u[best])
     return described(
         target,
         u[best],
@@ -224,22 +227,13 @@ def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
     return ends
 
 
-def _choose_starts(
-    target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float]
-) -> np.ndarray:
-    """``choose_starts``, while another thread compiles the derivatives; an error occurs again where they are used."""
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(_compile_descent, target)
-        return choose_starts(target, known, seed, first)
-
-
 def _compile_descent(target: LogPosterior) -> None:
     """Compile what ``_descend`` computes at a point."""
     u = dispersed_starts(target, 0, 1)
-    if any(e.has_joint_scatters for e in target.experiments):
+    if target.kinked:
         in_batches(partial(difference_descent.rows_of, target), u, difference_descent.ROWS)
     else:
-        linearised(HeldResiduals(target, jnp.asarray(u[0])), u[0, target.located])
+        linearised(target, u[0], u[0, target.located])
 
 
 def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
@@ -299,13 +293,13 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
     """Descend from one start (d,); stop where the cost exceeds ``limit`` or a number is not finite."""
     located = target.located
     u, still, fit = start.copy(), False, None
-    kinked = any(e.has_joint_scatters for e in target.experiments)
+    kinked = target.kinked
     for _ in range(ROUNDS_WITH_KINKS if kinked else ROUNDS):
         stop_if_interrupted()
         if kinked:
             fit = difference_descent.descend(target, u)
         else:
-            fit = least_squares(HeldResiduals(target, jnp.asarray(u)), u[located][None], SOLVER)
+            fit = least_squares(partial(linearised, target, u), u[located][None], SOLVER)
         if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):
             return _End(u, fit, False, -np.inf)
         sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))
@@ -346,10 +340,8 @@ def _is_converged(fit: LeastSquaresFit) -> bool:
 
 def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
     """Conditional maximum, in u, of every scatter given the located entries of u (d,), by index."""
-    groups = [(np.array([i]), lambda t, own=own: own(t[0])) for i, own in _scatter_terms(target, u).items()]
-    groups += [found for found in [_joint_scatters(target, u)] if len(found[0])]
     modes: dict[int, float] = {}
-    for members, density in groups:
+    for members, density in _scatter_densities(target, u):
         # The line search may try sizes that have no finite density, and rounding may end it at the maximum.
         with warnings.catch_warnings(), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
@@ -359,51 +351,43 @@ def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
 
 
 def _scatter_variances(target: LogPosterior, u: np.ndarray) -> np.ndarray:
-    """Inverse curvature of every scatter's conditional density at u (d,), in the order of the scatters."""
-    h, variances = 0.05, {}
-    members, together = _joint_scatters(target, u)
-    terms = _scatter_terms(target, u)
-    for place, i in enumerate(members.tolist()):
-        unit = np.eye(len(members))[place]
-        terms[i] = lambda t, unit=unit, i=i: together(u[members] + (t - u[i]) * unit)
-    for i, own in terms.items():
-        bend = (2.0 * own(u[i]) - own(u[i] + h) - own(u[i] - h)) / h**2
-        variances[i] = 1.0 / max(bend, 0.1)
-    return np.array([variances[i] for i in np.flatnonzero(target.scatter).tolist()])
+    """(d,) inverse curvature of every scatter's conditional density at u (d,); 0 for the located entries."""
+    h, variances = 0.05, np.zeros(len(u))
+    for members, density in _scatter_densities(target, u):
+        at = u[members]
+        for i, step in zip(members, h * np.eye(len(members)), strict=True):
+            bend = (2.0 * density(at) - density(at + step) - density(at - step)) / h**2
+            variances[i] = 1.0 / max(bend, 0.1)
+    return variances
 
 
-def _joint_scatters(target: LogPosterior, u: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], float]]:
-    """Indices of the scatters that only act together, and their log-density in u, up to a constant."""
-    own = [e for e in target.experiments if e.has_joint_scatters]
+def _scatter_densities(target: LogPosterior, u: np.ndarray) -> list[tuple[np.ndarray, Callable[[np.ndarray], float]]]:
+    """Indices of scatters, alone or those that only act together, and their log-density in u, up to a constant.
+
+    It is given the located entries of u (d,).
+    """
     values = target.mapping(target.theta(u))
-    names = dict.fromkeys(row.name for e in own for row in e.parameters if row.scatter)
-    members = np.array([target.names.index(name) for name in names], dtype=int)
-    profiles = [(e.profile(e.local(values)), {r.symbol: r.name for r in e.parameters if r.scatter}) for e in own]
-    priors = target.priors.at(members, np)
+    parts, profiles = dict[int, list[Misfit | Moments]](), list[tuple[Callable[..., float], dict[str, int]]]()
+    for e in target.experiments:
+        own = e.local(values)
+        index = {row.symbol: target.names.index(row.name) for row in e.parameters if row.scatter}
+        if e.has_joint_scatters:
+            profiles.append((e.profile(own), index))
+            continue
+        for part, symbol in zip(e.summaries(own, np), e.scatters, strict=True):
+            if symbol is not None:
+                parts.setdefault(index[symbol], []).append(part)
+
+    def prior(members: Any, t: Any) -> Any:
+        return target.priors.at(members, np).terms(t, np.exp(t), np)
+
+    def alone(i: int, t: np.ndarray) -> float:
+        return float(sum(part.log_density(np.exp(t[0]), np) for part in parts[i]) + prior(i, t[0]))
 
     def together(t: np.ndarray) -> float:
-        sizes = dict(zip(names, np.exp(t), strict=True))
-        total = sum(profile({s: sizes[name] for s, name in rows.items()}) for profile, rows in profiles)
-        return float(total + np.sum(priors.terms(t, np.exp(t), np)))
+        sizes = dict(zip(joint.tolist(), np.exp(t), strict=True))
+        total = sum(profile({s: sizes[i] for s, i in index.items()}) for profile, index in profiles)
+        return float(total + np.sum(prior(joint, t)))
 
-    return members, together
-
-
-def _scatter_terms(target: LogPosterior, u: np.ndarray) -> dict[int, Callable[[float], float]]:
-    """log-density of each scatter that acts alone, given the located entries of u (d,), up to a constant, by index."""
-    values = target.mapping(target.theta(u))
-    parts: dict[int, list[Misfit | Moments]] = {}
-    for experiment in target.experiments:
-        if experiment.has_joint_scatters:
-            continue
-        names = {row.symbol: row.name for row in experiment.parameters}
-        for part, symbol in zip(experiment.summaries(experiment.local(values), np), experiment.scatters, strict=True):
-            if symbol is not None:
-                parts.setdefault(target.names.index(names[symbol]), []).append(part)
-    priors = {i: target.priors.at(i, np) for i in parts}
-
-    def terms(i: int, t: float) -> float:
-        own = sum(part.log_density(np.exp(t), np) for part in parts[i])
-        return float(own + priors[i].terms(np.float64(t), np.exp(t), np))
-
-    return {i: partial(terms, i) for i in parts}
+    joint = np.array(list(dict.fromkeys(i for _, index in profiles for i in index.values())), dtype=int)
+    return [*((np.array([i]), partial(alone, i)) for i in parts), *([(joint, together)] if len(joint) else [])]

@@ -1,9 +1,9 @@
 """Nonlinear least squares from several starts, by derivatives or by differences."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +16,6 @@ from capsule_id.console import stop_if_interrupted
 from capsule_id.inference.curvature import (
     Jacobian,
     Residuals,
-    all_finite,
     column_space,
     in_batches,
 )
@@ -32,27 +31,15 @@ from capsule_id.precision import COMPILE, COMPILE_QUICKLY, require_float64
 
 require_float64()
 
-Residual = Callable[[jax.Array], jax.Array]
 #: A point (d,) -> residuals (n,) and their Jacobian (n, d).
 Linearise = Callable[[np.ndarray], tuple[Residuals, Jacobian]]
 
-
-@runtime_checkable
-class HasJacobian(Protocol):
-    """Residuals with a Jacobian that needs fewer tangents than parameters."""
-
-    def linearised(self, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Residuals (n,) and Jacobian (n, d) at v (d,)."""
-        ...
-
-
+#: Dimensionless. Smallest effect of a parameter on the residuals, relative to the strongest parameter, when it changes
+#: by 100 % of its start. Below it the scale is the step with this effect: a start at zero defines no scale.
 SMALLEST_EFFECT = 0.01
-"""Dimensionless. Smallest effect of a parameter on the residuals, relative to the strongest parameter, when it changes
-by 100 % of its start. Below it the scale is the step with this effect: a start at zero defines no scale."""
-
+#: Largest distance of a converged end from a stationary point, in radii of the joint confidence region, dimensionless
+#: (relative offset; Bates & Watts, *Technometrics* 23, 1981, 179).
 LARGEST_OFFSET = 1e-3
-"""Largest distance of a converged end from a stationary point, in radii of the joint confidence region, dimensionless
-(relative offset; Bates & Watts, *Technometrics* 23, 1981, 179)."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +87,8 @@ class Solver:
 SOLVER = Solver()
 
 
-def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVER) -> LeastSquaresFit:
-    """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
+def least_squares(linearise: Linearise, starts: np.ndarray, solver: Solver = SOLVER) -> LeastSquaresFit:
+    """Minimise ½ Σ r(x)² by Levenberg-Marquardt from every start.
 
     Residuals and Jacobian are one compiled program, and Optimistix' step is another. A program that held both would
     compile the residuals a second time, which takes longer than the fit.
@@ -112,10 +99,9 @@ def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVE
 
     Parameters
     ----------
-    residual : (d,) -> (n,), a JAX function; it may close over arrays. A ``jax.tree_util.Partial`` or ``equinox.Module``
-        passes its arrays as arguments: other values of the same shapes then need no new compilation
+    linearise : see ``Linearise``; threads call it
     starts : (s, d), units of the parameters
-    solver : tolerance and linear algebra of each start
+    solver : tolerance and scales of each start
 
     Raises
     ------
@@ -125,37 +111,18 @@ def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVE
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
-    descend = partial(_descend, partial(_linearised, residual, solver.heavy), solver=solver)
+    descent = partial(_descend, linearise, solver=solver)
     # The first start compiles the programs that all threads then call.
-    ends = [descend(starts[0]), *pool().map(descend, starts[1:])]
-    return _fit_of(ends)
+    ends = [descent(starts[0]), *pool().map(descent, starts[1:])]
+    x, residuals, jacobian, stalled = (np.stack(part) for part in zip(*ends, strict=True))
+    return LeastSquaresFit(x, 0.5 * np.sum(residuals**2, axis=1), stalled, residuals, jacobian)
 
 
-class _End(NamedTuple):
-    """Where one start ended: x (d,), residuals (n,) and Jacobian (n, d) there, and whether it is no minimum."""
-
-    x: np.ndarray
-    residuals: np.ndarray
-    jacobian: np.ndarray
-    stalled: bool
-
-
-def _fit_of(ends: "Sequence[_End]") -> LeastSquaresFit:
-    x, residuals, jacobian, stalled = zip(*ends, strict=True)
-    return LeastSquaresFit(
-        x=np.stack(x),
-        cost=0.5 * np.sum(np.stack(residuals) ** 2, axis=1),
-        stalled=np.array(stalled),
-        residuals=np.stack(residuals),
-        jacobian=np.stack(jacobian),
-    )
-
-
-def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
-    """Levenberg-Marquardt from one start (d,)."""
+def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> tuple[np.ndarray, Residuals, Jacobian, bool]:
+    """Where one start (d,) ended: x (d,), residuals (n,) and Jacobian (n, d) there, and whether it is no minimum."""
     residuals, jacobian = linearise(start)
-    if not all_finite(jacobian, residuals):
-        return _End(start, residuals, jacobian, True)
+    if not (np.isfinite(jacobian).all() and np.isfinite(residuals).all()):
+        return start, residuals, jacobian, True
     scale, unit = _effects(jacobian, solver.damping) if solver.heavy else _scales(jacobian, start)
     method = optx.LevenbergMarquardt(rtol=solver.tolerance, atol=solver.tolerance, linear_solver=lx.QR())
     known, v = _Known(residuals / unit, jacobian * scale / unit), jnp.asarray(start / scale)
@@ -170,14 +137,14 @@ def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
         at_trial, slopes = linearise(np.asarray(trial) * scale)
         with np.errstate(over="ignore", invalid="ignore"):
             known = _Known(at_trial / unit, slopes * scale / unit)
-        if not all_finite(known.jacobian, known.residuals):
+        if not (np.isfinite(known.jacobian).all() and np.isfinite(known.residuals).all()):
             # Infinite residuals make the solver reject the trial.
             known = _Known(np.full_like(at_trial, np.inf), np.zeros_like(slopes))
     x = np.asarray(v) * scale
     residuals, jacobian = linearise(x)
     # The solver tests step sizes only, and heavy damping makes steps small far from a minimum.
     short = not converged and steps == solver.max_steps
-    return _End(x, residuals, jacobian, short or not _stationary(jacobian, residuals, solver.tolerance * unit))
+    return x, residuals, jacobian, short or not _stationary(jacobian, residuals, solver.tolerance * unit)
 
 
 class _Known(eqx.Module):
@@ -225,27 +192,12 @@ def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bo
     return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
 
-def linearised(residual: Residual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (n,) and Jacobian (n, d) of heavy residuals at x (d,)."""
-    return _linearised(residual, True, x)
-
-
-def _linearised(residual: Residual, heavy: bool, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    residuals, jacobian = _PROGRAMS[heavy](residual, jnp.asarray(x))
+def linearised(target: LogPosterior, u: np.ndarray, x: np.ndarray, heavy: bool = True) -> tuple[Residuals, Jacobian]:
+    """Residuals (n,) of ``target`` at u (d,) with the located entries x (l,), and their Jacobian (n, l)."""
+    moved = u.copy()
+    moved[target.located] = x
+    residuals, jacobian = _PROGRAMS[heavy](target, jnp.asarray(moved))
     return np.asarray(residuals), np.asarray(jacobian)
-
-
-def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Residuals (n,) and Jacobian (n, d) at x (d,), in one pass: the residual's own ``linearised``, or forward mode."""
-    if isinstance(residual, HasJacobian):
-        return residual.linearised(x)
-
-    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        value = residual(x)
-        return value, value
-
-    jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
-    return value, jacobian
 
 
 #: Compiled first state and step of the solver.
@@ -253,10 +205,9 @@ _FIRST, _STEP = (
     eqx.filter_jit(function, compiler_options=dict(COMPILE_QUICKLY))  # pyright: ignore[reportCallIssue]
     for function in (_first, _step)
 )
-#: Compiled ``_linearise``, indexed by whether the residuals are heavy.
+#: Compiled ``LogPosterior.linearised``, indexed by whether the residuals are heavy.
 _PROGRAMS: dict[bool, Callable[..., Any]] = {
-    # Equinox passes the options to jax.jit, but its annotations omit them.
-    heavy: eqx.filter_jit(_linearise, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
+    heavy: jax.jit(LogPosterior.linearised, compiler_options=dict(options))
     for heavy, options in ((True, COMPILE), (False, COMPILE_QUICKLY))
 }
 
@@ -308,7 +259,7 @@ def descend(target: LogPosterior, u: np.ndarray, most: int = KINKED.max_steps) -
         residuals = in_batches(partial(rows_of, target), points, ROWS)
         return residuals[0], (residuals[1:] - residuals[0]).T / step
 
-    return _fit_of([_descend(differences, u[located], replace(KINKED, max_steps=most))])
+    return least_squares(differences, u[located][None], replace(KINKED, max_steps=most))
 
 
 @partial(jax.jit, compiler_options=COMPILE)

@@ -184,6 +184,10 @@ FARTHEST_WITH_KINKS = 20.0
 EMULATED_NODES, EMULATED_ERROR, PLACES = (16, 32, 64, 128), 0.02, 512
 
 
+#: Rows that are evaluated together where each takes more than this work, in readings: more would leave the caches.
+ROWS_TOGETHER, HEAVY = 8, 30_000
+
+
 @dataclass(frozen=True)
 class Layout:
     """Static structure of the integrated log-posterior.
@@ -216,12 +220,17 @@ class MarginalPosterior:
     centre, covariance : (dimension,), (dimension, dimension) Laplace approximation of u
     event_driven : for each block whether a motion of the capsule belongs to it
     normal_priors : (2, dimension) centre and width of the prior of u where it is normal; NaN elsewhere
+    theta, work : those of ``target``: constrained values, and time of an evaluation
+    can_be_emulated : whether there are motions to compute, and all of them are trials of a few numbers each
     scaled : ``LogPosterior.scaled``, indices among the located parameters
     kept : (2, scatters) block of each scatter and its place among the scatters of that block, see ``factors``
     """
 
     def __init__(self, target: LogPosterior, fit: PointFit) -> None:
         self.target, self.names, self._layout = target, target.names, _layout(target)
+        self.theta, self.work = target.theta, target.work
+        slow = [e for e in target.experiments if e.event_driven]
+        self.can_be_emulated = bool(slow) and all(isinstance(e, Progression) for e in slow)
         self._located, self._scatter = np.array(self._layout.located), np.array(self._layout.scatter, dtype=int)
         self._label = np.array(self._layout.block)
         self.dimension = len(self._located)
@@ -260,25 +269,6 @@ class MarginalPosterior:
         values = in_batches(one, v)
         # Scatters without located parameters in their block add a constant.
         return np.where(np.isfinite(values), values, -np.inf)[:, : len(self.blocks)]
-
-    def batch(self, v: np.ndarray) -> np.ndarray:
-        """(w,) log-posterior of the located u (w, dimension), up to the evidence; -inf where it is not finite."""
-        return np.sum(self.parts(v), axis=1)
-
-    def theta(self, u: np.ndarray) -> np.ndarray:
-        """(..., d) constrained values from the whole u (..., d)."""
-        return self.target.theta(u)
-
-    @property
-    def work(self) -> int:
-        """Time of an evaluation in units of that of one reading; 1 where it integrates motions of the capsule."""
-        return self.target.work
-
-    @property
-    def can_be_emulated(self) -> bool:
-        """Whether there are motions to compute, and all of them are trials of a few numbers each."""
-        slow = [e for e in self.target.experiments if e.event_driven]
-        return bool(slow) and all(isinstance(e, Progression) for e in slow)
 
     def motions(self, v: np.ndarray) -> list[np.ndarray]:
         """Motions of every experiment with trials at located u (w, dimension), (w, k) each."""
@@ -381,7 +371,7 @@ class MarginalPosterior:
         direction = np.random.default_rng(0).standard_normal((2 * BATCH, self.dimension))
         for block in self.blocks:
             direction[:, block] /= np.linalg.norm(direction[:, block], axis=1, keepdims=True)
-        kinked = any(e.has_joint_scatters for e in self.target.experiments)
+        kinked = self.target.kinked
         farthest = FARTHEST_WITH_KINKS if kinked else FARTHEST
         radius = np.concatenate([[0.0], np.geomspace(NEAREST, farthest, BATCH - 1)])
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
@@ -441,7 +431,10 @@ def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: 
     Logarithms of: terms without scatters (w, blocks); densities of t at the nodes (w, scatters, nodes), see
     ``capsule_id.inference.marginal``; their integrals (w, scatters).
     """
-    return target.by_rows(partial(_conditional, layout, target, bend), v, start, step)
+    of_row = partial(_conditional, layout, target, bend)
+    if target.work < HEAVY:
+        return jax.vmap(of_row)(v, start, step)
+    return jax.lax.map(lambda row: of_row(*row), (v, start, step), batch_size=ROWS_TOGETHER)
 
 
 def _conditional(

@@ -32,12 +32,10 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.kind import Registry
 from capsule_id.experiments.lint import lint
 from capsule_id.inference.checks.posterior import check_agreement, decisive_readings
-from capsule_id.inference.checks.settings import SampledFit
-from capsule_id.inference.checks.verdict import run_checks, with_scaled
-from capsule_id.inference.checks.widening import beside_stated, record_widenings, widenings
+from capsule_id.inference.checks.verdict import beside_stated, record_widenings, run_checks, widenings, with_scaled
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.point_fit import point_fit
-from capsule_id.inference.point_stage import PointStage
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS, sample
 from capsule_id.inference.tables import check_engine, make_notes, parameter_tables
@@ -92,14 +90,14 @@ def second_models(
 
 
 def sample_posterior(
-    point: PointStage,
+    point: SampledFit,
     seed: int,
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
     progress: OnProgress | None = None,
     ess: float = DEFAULT_ESS,
 ) -> SampledFit:
-    """Sample the posterior; return the point fit with its sample, without checks.
+    """Sample the posterior; return the point fit with its sample and ``BAND_DRAWS`` draws, evenly spaced, without checks.
 
     Parameters
     ----------
@@ -107,15 +105,17 @@ def sample_posterior(
     store : file for a copy of the chains every few seconds; sampling resumes from the draws in it
     progress, ess : see ``capsule_id.inference.sampling.sample``
     """
-    target, posterior = point.target, None
-    if budget is not None:
-        posterior = sample(MarginalPosterior(target, point.fit), seed, budget, store, progress, ess)
-    fit = point.fit if posterior is None else higher_maximum(point, posterior)
-    values, draws = {**target.fixed, **fit.values}, _draws(target, posterior)
-    return SampledFit(target, fit, posterior, values, draws, point.seed, findings=point.findings, bench=point.bench)
+    if budget is None:
+        return point
+    target = point.target
+    posterior = sample(MarginalPosterior(target, point.fit), seed, budget, store, progress, ess)
+    fit = higher_maximum(point, posterior)
+    flat = posterior.draws.reshape(-1, target.dimension)
+    draws = [target.mapping(flat[i]) for i in np.linspace(0, len(flat) - 1, BAND_DRAWS).astype(int)]
+    return replace(point, fit=fit, posterior=posterior, values={**target.fixed, **fit.values}, draws=draws)
 
 
-def higher_maximum(point: PointStage, posterior: Posterior) -> PointFit:
+def higher_maximum(point: SampledFit, posterior: Posterior) -> PointFit:
     """Repeat the point fit from the best draw where the sample has found a higher point than its starts did.
 
     Fits of forced runs stay as they are: they take minutes, and ``check_maximum`` reports the difference.
@@ -135,7 +135,7 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     stop_if_interrupted()
     before = [with_scaled(finding, sampled.experiments) for finding in before]
     checked = run_checks(replace(sampled, findings=before))
-    agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
+    agreement = check_agreement(sampled)
     checked = replace(
         checked, findings=(*checked.findings, *sampled.findings, *agreement, *check_engine(sampled), *before)
     )
@@ -149,9 +149,9 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     return replace(checked, widened=widened, findings=tuple(findings))
 
 
-def unfinished(point: PointStage, before: Sequence[Finding] = ()) -> SampledFit:
+def unfinished(point: SampledFit, before: Sequence[Finding] = ()) -> SampledFit:
     """Check the point fit alone, while the sample is still to be drawn; ``before`` as in ``check_fit``."""
-    checked = check_fit(sample_posterior(point, point.seed, None), before)
+    checked = check_fit(point, before)
     findings = [Finding("sample.unfinished", "warn") if f.code == "chains.converged" else f for f in checked.findings]
     return replace(checked, findings=tuple(findings))
 
@@ -215,14 +215,6 @@ def provenance(rig: Rig, seed: int, experiments: Choice, friction: str) -> Prove
 def package_versions(packages: Sequence[str]) -> dict[str, str]:
     """Versions of Python and of ``packages``, as installed."""
     return {"python": platform.python_version(), **{name: version(name) for name in packages}}
-
-
-def _draws(target: LogPosterior, posterior: Posterior | None) -> list[dict[str, float]]:
-    """Return ``BAND_DRAWS`` draws, evenly spaced over the sample, by parameter name."""
-    if posterior is None:
-        return []
-    flat = posterior.draws.reshape(-1, len(posterior.names))
-    return [target.mapping(flat[i]) for i in np.linspace(0, len(flat) - 1, BAND_DRAWS).astype(int)]
 
 
 def _comparisons(

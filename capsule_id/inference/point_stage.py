@@ -2,16 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy import stats
+from scipy.optimize import minimize
 
 from capsule_id.console import threads
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments, paper_estimates, select_tables
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks import Whiteness, correlated_records
+from capsule_id.experiments.context import Tension
 from capsule_id.experiments.friction_model import FrictionModel, SurfaceExperiment, model_lines
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.joint_fit import joint_fit
@@ -22,7 +25,123 @@ from capsule_id.inference.sampling import sample
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import is_stated
 from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
+
+# tension: Likelihood-ratio test of a parameter that two groups of experiments share (friction: tilts and slides).
+
+
+def tension(rig: Rig, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
+    """Likelihood-ratio test that two groups of experiments share their parameters (one shared parameter: mu).
+
+    Priors regularise both fits (a scatter from four trials needs one). They enter without their normalisation, so that
+    a second copy of a vague prior does not change the statistic.
+    """
+    joint, *apart = (_maximum(LogPosterior(rig, group)) for group in ([*one, *other], one, other))
+    statistic = max(2.0 * (apart[0][0] + apart[1][0] - joint[0]), 0.0)
+    return Tension(statistic, float(stats.chi2.sf(statistic, 1)), apart[0][1], apart[1][1])
+
+
+def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
+    """Largest penalised log-likelihood and its parameters, by name; NumPy suffices for a few readings."""
+    proposed = target.starts()
+    start = target.unconstrain(np.array([proposed[name].centre for name in target.names]))
+    # The masses change only a steady force here, so they keep their measured values.
+    free = np.array([row.symbol not in ("m1", "m2") for row in target.parameters])
+
+    def objective(v: np.ndarray) -> float:
+        u = start.copy()
+        u[free] = v
+        values = target.mapping(target.theta(u))
+        likelihood = sum(float(e.log_likelihood(e.local(values), np)) for e in target.experiments)
+        penalty = 0.5 * float(np.sum(target.prior_residuals(u)[free] ** 2))
+        return penalty - likelihood
+
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        best = minimize(objective, start[free], method="BFGS", options={"gtol": 1e-6})
+    u = start.copy()
+    u[free] = best.x
+    return -float(best.fun), target.mapping(target.theta(u))
+
+
+# sampled fit: Data of a finished fit that checks and tables read.
+
+
+#: Largest factor of an sd beside which the fit still gives a number.
+LARGEST_FACTOR = 30.0
+
+
+@dataclass(frozen=True)
+class Widening:
+    """Error of the model of one parameter.
+
+    Attributes
+    ----------
+    factor : of its sd, at least 1
+    quantile : Student's t quantile over the normal one, for the ends of the 95 % interval
+    parts : number of parts of the data
+    """
+
+    factor: float
+    quantile: float
+    parts: int
+
+    @property
+    def stretch(self) -> float:
+        """Factor of the half-length of the 95 % interval."""
+        return self.factor * self.quantile
+
+    @property
+    def no_number(self) -> bool:
+        """Whether the parts contradict each other so far that the fit gives no number."""
+        return not self.factor <= LARGEST_FACTOR
+
+
+@dataclass(frozen=True)
+class SampledFit:
+    """A point fit, its sample (None before and without one) and its findings so far.
+
+    ``target`` holds the experiments as fitted, with divided records.
+
+    See ``capsule_id.experiments.base.Fitted``.
+
+    Attributes
+    ----------
+    bench, bench_sample : fit and sample of the bench tests in closed form alone, where runs were fitted too
+    seed : seed of the starting points of further point fits
+    widened : error of the model by name of the parameter, where a check failed
+    """
+
+    target: LogPosterior
+    fit: PointFit
+    posterior: Posterior | None
+    values: Mapping[str, float]
+    draws: Sequence[Mapping[str, float]] = ()
+    seed: int = 0
+    flagged: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    findings: Sequence[Finding] = ()
+    bench: PointFit | None = None
+    bench_sample: Posterior | None = None
+    widened: Mapping[str, Widening] = field(default_factory=dict)
+
+    @property
+    def rig(self) -> Rig:
+        return self.target.rig
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        return self.target.experiments
+
+    def tension(self, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
+        return tension(self.rig, one, other)
+
+    def correlation(self, names: Sequence[str]) -> np.ndarray:
+        if self.draws:
+            return np.atleast_2d(np.corrcoef([[draw[name] for draw in self.draws] for name in names]))
+        chosen = [self.target.names.index(name) for name in names]
+        sd = np.sqrt(np.diag(self.fit.covariance))[chosen]
+        return self.fit.covariance[np.ix_(chosen, chosen)] / np.outer(sd, sd)
+
 
 # second fits: Further fits of runs whose residuals are correlated: coloured noise, then other friction laws.
 #
@@ -198,29 +317,7 @@ BENCH_BUDGET = 1000
 STAGE_ROUNDS = 3
 
 
-@dataclass(frozen=True)
-class BenchFit:
-    """Fit and sample of the bench tests in closed form alone, ``event_driven`` false.
-
-    Both are None where there are none; the sample is None where nothing was sampled.
-    """
-
-    fit: PointFit | None = None
-    sample: Posterior | None = None
-
-
-@dataclass(frozen=True)
-class PointStage:
-    """Result of the point fit; ``target`` holds the experiments as fitted, with divided records."""
-
-    target: LogPosterior
-    fit: PointFit
-    bench: BenchFit
-    seed: int
-    findings: tuple[Finding, ...] = ()
-
-
-def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: bool) -> PointStage:
+def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: bool) -> SampledFit:
     """Fit the experiments of ``target``.
 
     Parameters
@@ -231,10 +328,18 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
     """
     closed = [e for e in target.experiments if not e.event_driven]
     if len(closed) == len(target.experiments):
-        return PointStage(target, point_fit(target, seed), BenchFit(), seed)
+        fit = point_fit(target, seed)
+        return SampledFit(target, fit, None, {**target.fixed, **fit.values}, seed=seed)
     alone = LogPosterior(target.rig, closed) if closed else None
     bench = None if alone is None else point_fit(alone, seed)
-    known = _paper_values(target, registry) if bench is None else dict(bench.values)
+    if bench is None:
+        # The paper's estimates from the rig's bench tests, including tests that ``target`` lacks.
+        tests = [e for e in target.experiments if e.bench]
+        if not tests and select_tables(target.rig, "bench"):
+            tests = make_experiments(target.rig, "bench", registry)
+        known = paper_estimates(tests, registry)
+    else:
+        known = dict(bench.values)
     target, findings = cut_unpredictable(target, known)
     # The joint fit takes one core most of the time: the bench is sampled on another one.
     with threads(1) as beside:
@@ -244,8 +349,9 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
         target, joint, wavering = _fit_with_right_starts(target, known, seed)
         target, joint, second = fit_coloured(target, joint, seed)
         second += compare_laws(target, joint, seed)
-        bench_fit = BenchFit(bench, None if own is None else own.result())
-    return PointStage(target, joint, bench_fit, seed, (*findings, *wavering, *second))
+        bench_sample = None if own is None else own.result()
+    found, values = (*findings, *wavering, *second), {**target.fixed, **joint.values}
+    return SampledFit(target, joint, None, values, (), seed, findings=found, bench=bench, bench_sample=bench_sample)
 
 
 def _fit_with_right_starts(
@@ -263,14 +369,6 @@ def _fit_with_right_starts(
     doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
     facts = {"labels": ", ".join(doubtful), "rounds": STAGE_ROUNDS}
     return target, joint, [Finding("runs.start", "fail", facts, doubtful[0])]
-
-
-def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:
-    """Return the paper's estimates from the rig's bench tests, including tests that ``target`` lacks."""
-    bench = [e for e in target.experiments if e.bench]
-    if not bench and select_tables(target.rig, "bench"):
-        bench = make_experiments(target.rig, "bench", registry)
-    return paper_estimates(bench, registry)
 
 
 def cut_unpredictable(target: LogPosterior, known: Mapping[str, float]) -> tuple[LogPosterior, list[Finding]]:

@@ -8,15 +8,10 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.experiments import Choice
-from capsule_id.experiments.context import RunRecord as RunRecord
+from capsule_id.experiments.context import RunRecord
 from capsule_id.experiments.kind import Registry
 from capsule_id.rig.model import Rig
-from capsule_id.views import Comparison as Comparison
-from capsule_id.views import Curve as Curve
-from capsule_id.views import Finding as Finding
-from capsule_id.views import Points as Points
-from capsule_id.views import ResultTable as ResultTable
-from capsule_id.views import Trust as Trust
+from capsule_id.views import Comparison, Finding, ResultTable, Trust
 
 #: Begins the name of an input that is a reading with an sd in rig.toml, such as a weighing.
 STATED = "stated value of "

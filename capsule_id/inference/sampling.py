@@ -9,35 +9,40 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple
 
 import numpy as np
 from emcee import State
 
 from capsule_id.console import OnProgress
-from capsule_id.inference.ensemble import ChainStore, Ensemble, OpenBackend, initial_state
+from capsule_id.inference.curvature import Random
+from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.moves import (
+    ChainStore,
+    Ensemble,
     Moves,
+    OpenBackend,
     block_move,
     bulk_and_tail_size,
     delayed_moves,
     effective_sample_size,
     ensemble_time,
+    initial_state,
     integrated_time,
     pooled_time,
     split_rhat,
 )
-from capsule_id.inference.proposal import BlockProposal, block_proposal
-from capsule_id.inference.refinement import (
+from capsule_id.inference.proposal import (
     LARGEST_MAP,
     NO_MASS,
+    BlockProposal,
     Transported,
     affordable_rounds,
+    block_proposal,
     effective_size,
     refined,
 )
 from capsule_id.inference.result import Posterior
-from capsule_id.inference.target import Scale
 
 # emulation: Emulation of a posterior whose motions take long: exact motions near the posterior, and emulators fitted
 # to them.
@@ -66,25 +71,12 @@ FAR = 15.0
 AGAIN, MAPS = 3, 2
 
 
-class Emulable(Protocol):
-    """A density whose motions can be emulated; see ``capsule_id.inference.marginal.MarginalPosterior``."""
-
-    normal_priors: np.ndarray
-    scaled: list[Scale]
-
-    def parts(self, v: np.ndarray) -> np.ndarray: ...
-
-    def motions(self, v: np.ndarray) -> list[np.ndarray]: ...
-
-    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Self: ...
-
-
 class Places(NamedTuple):
     """Draws v (n, d) of a chain, from which walkers begin."""
 
     v: np.ndarray
 
-    def draw(self, random: np.random.RandomState, size: int) -> np.ndarray:
+    def draw(self, random: Random, size: int) -> np.ndarray:
         """(size, d)"""
         return self.v[random.choice(len(self.v), size, replace=size > len(self.v))]
 
@@ -95,7 +87,7 @@ class ExactMotions(NamedTuple):
     v: np.ndarray
     motions: list[np.ndarray]
 
-    def more(self, target: Emulable, v: np.ndarray) -> "ExactMotions":
+    def more(self, target: MarginalPosterior, v: np.ndarray) -> "ExactMotions":
         """With the motions at further v (w, d)."""
         pairs = zip(self.motions, target.motions(v), strict=True)
         return ExactMotions(np.concatenate([self.v, v]), [np.concatenate(pair) for pair in pairs])
@@ -104,25 +96,24 @@ class ExactMotions(NamedTuple):
 class Emulation(NamedTuple):
     """An emulated posterior, the motions that it knows, the proposal that is adapted to it, and draws of it."""
 
-    target: Emulable
+    target: MarginalPosterior
     known: ExactMotions
     proposal: BlockProposal
     start: Places
 
-    def draw(self, number: int, random: np.random.RandomState) -> np.ndarray:
+    def draw(self, number: int, random: Random) -> np.ndarray:
         """``number`` draws (w, d) of the emulated posterior, by chains that go on from ``start``."""
         found = [self.start.v]
         while sum(map(len, found)) < number:
-            chain = _chain(self.target, found[-1], block_move(self.proposal), random)
-            found.append(chain.run(STEPS, store=False).state.coords)
+            found.append(_walked(self.target, found[-1], block_move(self.proposal), random))
         return np.concatenate(found)[:number]
 
 
 def emulation(
-    target: Emulable,
+    target: MarginalPosterior,
     first: BlockProposal,
     large: list[bool],
-    random: np.random.RandomState,
+    random: Random,
     known: ExactMotions | None = None,
 ) -> Emulation:
     """Emulate ``target``.
@@ -139,11 +130,17 @@ def emulation(
         If hardly any draw has finite motions, or a finite log-density.
     """
     adaptations, last_rounds = (None, DELAYED_ROUNDS) if known is None else (AGAIN, 0)
-    known, proposal = known or _first_motions(target, first, random), first
+    if known is None:
+        v = _finite(first, random, FIRST_DRAWS)
+        known = ExactMotions(v, target.motions(v))
+        if any(np.sum(np.all(np.isfinite(own), axis=1)) < 2 * v.shape[1] for own in known.motions):
+            raise RuntimeError(NO_MASS)
+    proposal = first
     for _ in range(ROUNDS):
         emulated = target.emulated(*known)
         proposal = refined(emulated.parts, proposal, target.normal_priors, random, large, adaptations)
-        drawn, adaptations = _draws(emulated, proposal, random), AGAIN
+        v = _inside(emulated, _finite(proposal, random, 2 * DRAWS))[:DRAWS]
+        drawn, adaptations = _walked(emulated, v, block_move(proposal), random), AGAIN
         checked = drawn[:CHECKED]
         log_weight = np.sum(target.parts(checked), axis=1) - np.sum(emulated.parts(checked), axis=1)
         known = known.more(target, np.concatenate([_around(drawn, random) for _ in range(PLACES)]))
@@ -153,53 +150,58 @@ def emulation(
     found = _adapted(target, known, proposal, drawn, large, random)
     for _ in range(last_rounds):
         moves = delayed_moves(found.target.parts, found.proposal, found.start.v, STEPS, target.scaled, OTHER)
-        walkers = _chain(target, walkers, moves, random).run(EXACT_STEPS, store=False).state.coords
+        walkers = _walked(target, walkers, moves, random, EXACT_STEPS)
         found = corrected(target, found, walkers, large, random)
     return found
 
 
 def corrected(
-    target: Emulable, before: Emulation, walkers: np.ndarray, large: list[bool], random: np.random.RandomState
+    target: MarginalPosterior, before: Emulation, walkers: np.ndarray, large: list[bool], random: Random
 ) -> Emulation:
     """Emulate ``target`` with further exact motions about ``walkers`` (w, d) of delayed acceptance by ``before``.
 
-    Walkers stay where the emulated density is far too small, so that the motions added there correct it.
+    Walkers stay where the emulated density is far too small, so that the motions added there correct it. Draws of the
+    wide proposal give further motions.
     """
-    known = before.known.more(target, _last_places(before.target, before.proposal, walkers, random))
+    emulated, wide = before.target, _finite(before.proposal, random, 2 * DRAWS)
+    least = np.median(np.sum(emulated.parts(walkers), axis=1)) - FAR
+    wide = wide[np.sum(emulated.parts(wide), axis=1) > least][:DRAWS]
+    places = [wide, *(_around(walkers, random) for _ in range(max(1, DRAWS // len(walkers))))]
+    known = before.known.more(target, np.concatenate(places))
     return _adapted(target, known, before.proposal, before.start.v, large, random)
 
 
 def _adapted(
-    target: Emulable,
+    target: MarginalPosterior,
     known: ExactMotions,
     proposal: BlockProposal,
     v: np.ndarray,
     large: list[bool],
-    random: np.random.RandomState,
+    random: Random,
 ) -> Emulation:
-    """Emulator of ``known``, with the proposal and the draws of a chain from v (w, d) that follow it."""
+    """Emulator of ``known``, its proposal with maps of the large blocks, and the last places of a chain from v (w, d).
+
+    The maps follow the chain, whose draws determine a map better than weighted draws: few of these hold most of the weight.
+    """
     emulated = target.emulated(*known)
-    proposal, drawn = _follow(emulated, proposal, v, large, random)
-    return Emulation(emulated, known, proposal, Places(drawn))
+    for _ in range(MAPS):
+        ensemble = _chain(emulated, v, block_move(proposal), random).run(STEPS)
+        v = ensemble.state.coords
+        drawn = np.concatenate([v, ensemble.chain[STEPS // 2]])
+        equal = np.full(len(drawn), 1.0 / len(drawn))
+        pairs = zip(proposal.blocks, proposal.densities, large, strict=True)
+        maps = [Transported(drawn[:, b], equal) if own and len(b) <= LARGEST_MAP else q for b, q, own in pairs]
+        proposal = BlockProposal(proposal.blocks, maps)
+    return Emulation(emulated, known, proposal, Places(v))
 
 
-def _first_motions(target: Emulable, first: BlockProposal, random: np.random.RandomState) -> ExactMotions:
-    v = first.draw(random, FIRST_DRAWS)
-    v = v[np.all(np.isfinite(v), axis=1)]
-    motions = target.motions(v)
-    if any(np.sum(np.all(np.isfinite(own), axis=1)) < 2 * v.shape[1] for own in motions):
-        raise RuntimeError(NO_MASS)
-    return ExactMotions(v, motions)
+def _finite(density: BlockProposal | Places, random: Random, size: int) -> np.ndarray:
+    """Those of ``size`` draws (size, d) that are finite."""
+    v = density.draw(random, size)
+    return v[np.all(np.isfinite(v), axis=1)]
 
 
-def _draws(target: Emulable, proposal: BlockProposal, random: np.random.RandomState) -> np.ndarray:
-    """``DRAWS`` draws of ``target``: the last places of as many walkers that begin with draws of ``proposal``."""
-    v = proposal.draw(random, 2 * DRAWS)
-    v = _inside(target, v[np.all(np.isfinite(v), axis=1)])[:DRAWS]
-    return _chain(target, v, block_move(proposal), random).run(STEPS, store=False).state.coords
-
-
-def _inside(target: Emulable, v: np.ndarray) -> np.ndarray:
+def _inside(target: MarginalPosterior, v: np.ndarray) -> np.ndarray:
     """Those of v (w, d) where the density of ``target`` is not 0, enough for the walkers of a chain."""
     v = v[np.all(np.isfinite(target.parts(v)), axis=1)]
     if len(v) < 2 * v.shape[1]:
@@ -207,44 +209,20 @@ def _inside(target: Emulable, v: np.ndarray) -> np.ndarray:
     return v
 
 
-def _chain(target: Emulable, v: np.ndarray, moves: Moves, random: np.random.RandomState) -> Ensemble:
+def _chain(target: MarginalPosterior, v: np.ndarray, moves: Moves, random: Random) -> Ensemble:
     """Walkers at v (w, d). Each chain gets random numbers of its own: chains with the same ones come together."""
     own = np.random.RandomState(random.randint(2**32, dtype=np.uint64))
     return Ensemble(target.parts, initial_state(v, own), moves)
 
 
-def _around(v: np.ndarray, random: np.random.RandomState) -> np.ndarray:
+def _walked(target: MarginalPosterior, v: np.ndarray, moves: Moves, random: Random, steps: int = STEPS) -> np.ndarray:
+    """Last places (w, d) of walkers from v (w, d)."""
+    return _chain(target, v, moves, random).run(steps, store=False).state.coords
+
+
+def _around(v: np.ndarray, random: Random) -> np.ndarray:
     """Draws v (w, d) with normal noise: the emulator needs motions around the posterior too, not only inside it."""
     return v + NOISE * random.multivariate_normal(np.zeros(v.shape[1]), np.atleast_2d(np.cov(v.T)), len(v))
-
-
-def _last_places(
-    emulated: Emulable, proposal: BlockProposal, walkers: np.ndarray, random: np.random.RandomState
-) -> np.ndarray:
-    """Places about ``walkers`` (w, d) of delayed acceptance, and draws of the wide proposal."""
-    wide = proposal.draw(random, 2 * DRAWS)
-    wide = wide[np.all(np.isfinite(wide), axis=1)]
-    least = np.median(np.sum(emulated.parts(walkers), axis=1)) - FAR
-    wide = wide[np.sum(emulated.parts(wide), axis=1) > least][:DRAWS]
-    return np.concatenate([wide, *(_around(walkers, random) for _ in range(max(1, DRAWS // len(walkers))))])
-
-
-def _follow(
-    target: Emulable, proposal: BlockProposal, v: np.ndarray, large: list[bool], random: np.random.RandomState
-) -> tuple[BlockProposal, np.ndarray]:
-    """Proposal with maps of the large blocks that follow a chain of ``target`` from draws v (w, d), and its last places.
-
-    Draws of a chain determine a map better than weighted draws: few of these hold most of the weight.
-    """
-    for _ in range(MAPS):
-        ensemble = _chain(target, v, block_move(proposal), random).run(STEPS)
-        v = ensemble.state.coords
-        drawn = np.concatenate([v, ensemble.chain[STEPS // 2]])
-        equal = np.full(len(drawn), 1.0 / len(drawn))
-        pairs = zip(proposal.blocks, proposal.densities, large, strict=True)
-        maps = [Transported(drawn[:, b], equal) if own and len(b) <= LARGEST_MAP else q for b, q, own in pairs]
-        proposal = BlockProposal(proposal.blocks, maps)
-    return proposal, v
 
 
 # ensembles: Sampling by independent emcee ensembles until convergence or a step limit, with regular saving.
@@ -317,52 +295,9 @@ class Schedule:
         """Steps per stored draw of the recorded run."""
         return int(np.clip(self.tau / DRAWS_PER_TAU, 1, MAX_THIN))
 
-    @property
-    def burn_in(self) -> int:
-        """Steps of an ensemble before its first stored draw."""
-        return int(np.ceil(BURN_IN_IN_TAU * self.tau))
-
-
-class Target(Protocol):
-    """A density to sample; see ``capsule_id.inference.marginal.MarginalPosterior``."""
-
-    names: tuple[str, ...]
-    dimension: int
-    blocks: list[np.ndarray]
-    centre: np.ndarray
-    covariance: np.ndarray
-    normal_priors: np.ndarray
-    scaled: list[Scale]
-    event_driven: list[bool]
-
-    @property
-    def work(self) -> int:
-        """Time of an evaluation, see ``MarginalPosterior``."""
-        ...
-
-    @property
-    def can_be_emulated(self) -> bool: ...
-
-    @property
-    def fingerprint(self) -> str:
-        """Equal for equal densities: saved draws of another density are not resumed."""
-        ...
-
-    def parts(self, v: np.ndarray) -> np.ndarray: ...
-
-    def motions(self, v: np.ndarray) -> list[np.ndarray]: ...
-
-    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Self: ...
-
-    def factors(self, v: np.ndarray) -> np.ndarray: ...
-
-    def whole(self, located: np.ndarray, factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
-
-    def theta(self, u: np.ndarray) -> np.ndarray: ...
-
 
 def sample(
-    target: Target,
+    target: MarginalPosterior,
     seed: int,
     budget: int = DEFAULT_BUDGET,
     store: Path | None = None,
@@ -421,7 +356,7 @@ def sample(
     )
 
 
-def _completed(target: Target, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
+def _completed(target: MarginalPosterior, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
     """The first ``goal`` draws (ensemble, draw, walker, d) with scatters, and their log-posterior.
 
     Each proposal brings a draw of its scatters, which is accepted without regard to it.
@@ -438,23 +373,21 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
     return bool(np.all(draws.shape[1] > LENGTH_IN_TAU * pooled_time(draws)))
 
 
-def pilot(target: Target, seed: int) -> Schedule:
-    """Find a proposal, and measure the autocorrelation time of its moves."""
-    return (_emulated if target.can_be_emulated else _proposed)(target, np.random.RandomState(seed))
-
-
-def _proposed(target: Target, random: np.random.RandomState) -> Schedule:
-    """Moves by an adapted proposal.
+def pilot(target: MarginalPosterior, seed: int) -> Schedule:
+    """Find a proposal, and measure the autocorrelation time of its moves.
 
     A short chain of the Laplace approximation does not show what it has missed; rounds of weighted draws find it.
     """
+    random = np.random.RandomState(seed)
+    if target.can_be_emulated:
+        return _emulated(target, random)
     proposal = adapted_proposal(target, random)
     moves = block_move(proposal)
     walkers = Ensemble(target.parts, _initial(target, proposal, random), moves)
     return Schedule(proposal, FIRST, moves, walkers.run(PILOT_STEPS))
 
 
-def _emulated(target: Target, random: np.random.RandomState) -> Schedule:
+def _emulated(target: MarginalPosterior, random: Random) -> Schedule:
     """Moves of delayed acceptance by an emulated posterior.
 
     A long autocorrelation time may mean that walkers stay where the emulator is wrong: it learns the motions there. The
@@ -472,27 +405,23 @@ def _emulated(target: Target, random: np.random.RandomState) -> Schedule:
     return first
 
 
-def _delayed(target: Target, found: Emulation, state: State) -> Schedule:
+def _delayed(target: MarginalPosterior, found: Emulation, state: State) -> Schedule:
     """Moves of delayed acceptance by the emulated posterior ``found``, and walkers that they move from ``state`` on."""
     moves = delayed_moves(found.target.parts, found.proposal, found.start.v, DELAYED_STEPS, target.scaled)
     return Schedule(found.start, DELAYED, moves, Ensemble(target.parts, state, moves).run(PILOT_STEPS))
 
 
-def adapted_proposal(
-    target: Target, random: np.random.RandomState, first: BlockProposal | None = None
-) -> BlockProposal:
+def adapted_proposal(target: MarginalPosterior, random: Random, first: BlockProposal | None = None) -> BlockProposal:
     """Proposal adapted to the density of ``target``, from the Laplace approximation.
 
     A proposal ``first`` that is adapted to a similar density takes its place, and needs ``NEAR`` rounds only.
     """
     laplace, large = laplace_proposal(target)
-    if first is not None:
-        return refined(target.parts, first, target.normal_priors, random, large, NEAR)
-    rounds = affordable_rounds(PILOT_WORK / target.work)
-    return refined(target.parts, laplace, target.normal_priors, random, large, rounds)
+    rounds = affordable_rounds(PILOT_WORK / target.work) if first is None else NEAR
+    return refined(target.parts, first or laplace, target.normal_priors, random, large, rounds)
 
 
-def laplace_proposal(target: Target) -> tuple[BlockProposal, list[bool]]:
+def laplace_proposal(target: MarginalPosterior) -> tuple[BlockProposal, list[bool]]:
     """The Laplace approximation as a proposal, and for each block whether it is large.
 
     A bench test is not: terms of a decay that may be absent need components that draw them from their priors.
@@ -530,7 +459,7 @@ def _advance(samplers: Sequence[Ensemble], goal: int, thin: int) -> Iterator[int
             yield sum(sampler.stored for sampler in samplers)
 
 
-def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
+def _sampler(target: MarginalPosterior, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
     """Return one ensemble: burnt in from its own start, or resumed from ``backend``.
 
     The starts are draws of the adapted proposal, or of the emulated posterior.
@@ -539,19 +468,19 @@ def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend
     if last is not None:
         return Ensemble(target.factors, last, schedule.moves, backend)
     start = _initial(target, schedule.start, np.random.RandomState(seed))
-    burnt_in = Ensemble(target.factors, start, schedule.moves).run(schedule.burn_in, store=False).state
+    steps = int(np.ceil(BURN_IN_IN_TAU * schedule.tau))
+    burnt_in = Ensemble(target.factors, start, schedule.moves).run(steps, store=False).state
     if backend is not None:
         backend.reset(*start.coords.shape)
     return Ensemble(target.factors, burnt_in, schedule.moves, backend)
 
 
-def _initial(target: Target, density: BlockProposal | Places, random: np.random.RandomState) -> State:
+def _initial(target: MarginalPosterior, density: BlockProposal | Places, random: Random) -> State:
     """Walkers drawn from ``density``, each at a finite log-posterior."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
     u = np.empty((0, target.dimension))
     for _ in range(100):
-        drawn = density.draw(random, walkers)
-        drawn = drawn[np.all(np.isfinite(drawn), axis=1)]
+        drawn = _finite(density, random, walkers)
         u = np.concatenate([u, drawn[np.all(np.isfinite(target.parts(drawn)), axis=1)]])
         if len(u) >= walkers:
             return initial_state(u[:walkers], random)

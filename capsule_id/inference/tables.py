@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -11,14 +10,13 @@ import pandas as pd
 from capsule_id.experiments import paper_estimates
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.checks.posterior import runs_alone
-from capsule_id.inference.checks.settings import SampledFit, Widening
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
 from capsule_id.inference.curvature import covariance
-from capsule_id.inference.least_squares import linearised
+from capsule_id.inference.least_squares import linearised, rows_of
 from capsule_id.inference.point_fit import residual_jacobian
-from capsule_id.inference.point_stage import BenchFit
+from capsule_id.inference.point_stage import SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
-from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.views import Finding, ResultTable
@@ -32,15 +30,16 @@ WIDTHS = {name: getattr(Smoothing(), name) for name in ("velocity", "penetration
 SMALL_SHIFT, LARGE_SHIFT = 0.2, 1.0
 
 
-def precision_gained(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> ResultTable:
+def precision_gained(s: SampledFit) -> ResultTable:
     """Posterior sd from bench only, runs only, and both; from samples where they exist, else from point fits."""
+    target, joint = s.target, s.fit
     shared, known = shared_symbols(target), run_parameters(target)
     alone = runs_alone(target, joint)
     sds = dict(zip(alone.names, np.sqrt(np.diag(alone.covariance)), strict=True))
     runs = {name: float(sd * abs(joint.values[name])) if name in known else np.nan for name, sd in sds.items()}
     rows = {}
     for name in (row.name for row in target.parameters if row.symbol in shared):
-        rows[name] = [_sd(bench.fit, bench.sample, name), runs[name], _sd(joint, sample, name)]
+        rows[name] = [_sd(s.bench, s.bench_sample, name), runs[name], _sd(joint, s.posterior, name)]
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["bench only", "runs only", "both"])
     frame["bench only / both"] = frame["bench only"] / frame["both"]
     return ResultTable("runs.precision", frame.rename_axis("parameter"))
@@ -73,22 +72,15 @@ def smoothing_certificate(target: LogPosterior, fit: PointFit) -> ResultTable:
     """
     smooth = target.rig.model.engine == "smooth"
     engines = {"engine": "smoothed", "other": "exact"} if smooth else {"engine": "exact", "other": "smoothed"}
-    shift, sd = smoothing_shift(target, fit, None if smooth else Smoothing())
-    located = target.located
-    rows = {target.names[i]: [d, s, d / s] for i, d, s in zip(located, shift, sd, strict=True)}
+    named = zip(target.located, *smoothing_shift(target, fit, None if smooth else Smoothing()), strict=True)
+    rows = {target.names[i]: [d, s, d / s] for i, d, s in named if target.parameters[i].physical}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["shift of u", "sd of u", "shift / sd"])
-    frame = frame.loc[[name for name in frame.index if target.parameters[target.names.index(name)].physical]]
     return ResultTable("runs.smoothing", frame.rename_axis("parameter"), {**engines, **WIDTHS})
-
-
-@eqx.filter_jit
-def _evaluate(residual: HeldResiduals, v: Any) -> Any:
-    return residual(v)
 
 
 def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing | None) -> tuple[np.ndarray, np.ndarray]:
     """(d_located,) shift of u between a fit with the engine of ``widths`` (None: exact) and this fit, and the sd of u."""
-    own, jacobian = linearised(HeldResiduals(target, jnp.asarray(fit.u)), fit.u[target.located])
+    own, jacobian = linearised(target, fit.u, fit.u[target.located])
     normal = jacobian.T @ jacobian
     step = -np.linalg.solve(normal, jacobian.T @ (_residuals(_by_engine(target, widths), fit) - own))
     return step, np.sqrt(np.diag(np.linalg.inv(normal)))
@@ -100,8 +92,7 @@ def _by_engine(target: LogPosterior, widths: Smoothing | None) -> LogPosterior:
 
 def _residuals(target: LogPosterior, fit: PointFit) -> np.ndarray:
     """(n,) residuals at the point fit, in units of the noise."""
-    centre = jnp.asarray(fit.u)
-    return np.asarray(_evaluate(HeldResiduals(target, centre), centre[target.located]))
+    return np.asarray(rows_of(target, jnp.asarray(fit.u[None])))[0]
 
 
 def check_engine(sampled: SampledFit) -> list[Finding]:
@@ -113,13 +104,12 @@ def check_engine(sampled: SampledFit) -> list[Finding]:
     moved = [e for e in target.experiments if e.event_driven]
     if target.rig.model.engine == "exact" or not moved:
         return []
-    if any(e.has_joint_scatters for e in target.experiments):
+    if target.kinked:
         bound = np.linalg.norm(_residuals(_by_engine(target, None), fit) - _residuals(target, fit))
         shifts = {row.name: float(bound) for e in moved for row in e.parameters if row.physical}
     else:
-        shift, sd = smoothing_shift(target, fit, None)
-        named = zip(target.located, np.abs(shift) / sd, strict=True)
-        shifts = {row.name: float(s) for row, s in ((target.parameters[i], s) for i, s in named) if row.physical}
+        named = zip(target.located, *smoothing_shift(target, fit, None), strict=True)
+        shifts = {target.names[i]: float(abs(d) / s) for i, d, s in named if target.parameters[i].physical}
     # A shift that is not finite fails.
     names = tuple(name for name, s in shifts.items() if not s <= SMALL_SHIFT)
     level = "ok" if not names else "warn" if all(s <= LARGE_SHIFT for s in shifts.values()) else "fail"
@@ -149,12 +139,23 @@ def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> l
         for found in sampled.findings
         if (rows := found.facts.get("alternatives"))
     ]
-    kinked = any(e.has_joint_scatters for e in sampled.experiments)
+    kinked = target.kinked
     if any(not e.bench for e in sampled.experiments) and not kinked:
-        gained = precision_gained(target, fit, sampled.posterior, sampled.bench)
+        gained = precision_gained(sampled)
         of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
-    tables = [*of_runs, *of_bench, *compared, *([] if kinked else share_table(target, fit)), prior_table(target)]
-    return [*tables, predictive_table(sampled, predictive)] if sampled.draws else tables
+    priors = [
+        {"parameter": row.name, "unit": row.unit, "meaning": row.meaning, "prior (SI)": row.prior.describe()}
+        for row in target.parameters
+        if row.prior is not None
+    ]
+    tables = [*of_runs, *of_bench, *compared, *([] if kinked else share_table(target, fit))]
+    tables.append(ResultTable("parameters.priors", pd.DataFrame(priors).set_index("parameter")))
+    if sampled.draws:
+        # Experiments on the shared friction panel have a p-value too.
+        rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in sampled.experiments}
+        frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"])
+        tables.append(ResultTable("readings.predictive", frame.rename_axis("experiment")))
+    return tables
 
 
 def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
@@ -167,23 +168,6 @@ def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
         rows, orient="index", columns=["largest input", "share", "second input", "share of it"]
     )
     return [ResultTable("parameters.shares", frame.round(3).rename_axis("parameter"))] * bool(rows)
-
-
-def prior_table(target: LogPosterior) -> ResultTable:
-    """Every parameter with its prior, SI."""
-    rows = [
-        {"parameter": row.name, "unit": row.unit, "meaning": row.meaning, "prior (SI)": row.prior.describe()}
-        for row in target.parameters
-        if row.prior is not None
-    ]
-    return ResultTable("parameters.priors", pd.DataFrame(rows).set_index("parameter"))
-
-
-def predictive_table(sampled: SampledFit, predictive: Mapping[str, float | None]) -> ResultTable:
-    """Posterior predictive p-value of every experiment, those on the shared friction panel included."""
-    rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in sampled.experiments}
-    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"])
-    return ResultTable("readings.predictive", frame.rename_axis("experiment"))
 
 
 # parameter table: The parameter table and the nuisance table of a result.
@@ -216,7 +200,7 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
     words = trust_words(sampled, known)
     rows: list[tuple[Parameter, dict[str, object]]] = []
     for i, row in enumerate(target.parameters):
-        entry: dict[str, object] = {
+        entry: dict[str, Any] = {
             "unit": row.unit,
             "meaning": row.meaning,
             "paper": paper.get(row.name, np.nan),
@@ -228,7 +212,12 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             "standard_error": at_point[row.name],
             "informed": bool(known[i]),
         }
-        entry |= {} if posterior is None else _sample_columns(posterior, i)
+        if posterior is not None:
+            draws = posterior.draws[..., i].ravel()
+            lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
+            entry |= {"value": median, "sd": np.std(draws, ddof=1), "basis": "sample"}
+            entry |= {"mean": np.mean(draws), "median": median, "lower": lower, "upper": upper}
+            entry |= {name: getattr(posterior, name)[i] for name in ("ess", "ess_bulk", "ess_tail", "rhat")}
         entry |= _widened(entry, sampled.widened.get(row.name), row.positive)
         entry |= _limited(entry) if row.positive else {}
         rows.append((row, {**entry, "quote": quote(entry, row.positive)}))
@@ -275,8 +264,7 @@ def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, fl
         density += np.log(np.cosh(x)) + np.mean(0.5 * np.log(variance), axis=1) * np.sum(hat[rows])
         weight = np.exp(density - np.max(density))
         jacobian[rows] *= (misfit.at(own[symbol], np).sd / np.sqrt(weight @ variance / np.sum(weight)))[:, None]
-    matrix = covariance(jacobian)
-    errors = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    errors = np.sqrt(np.diag(covariance(jacobian))) * np.where(target.positive, theta, 1.0)[located]
     return {**fit.standard_errors, **{target.names[i]: float(sd) for i, sd in zip(located, errors, strict=True)}}
 
 
@@ -315,21 +303,3 @@ def quote(entry: Mapping[str, Any], positive: bool) -> Literal["sd", "interval"]
     short, long = sorted((entry["value"] - entry["lower"], entry["upper"] - entry["value"]))
     outside = positive and entry["value"] <= 2.0 * entry["sd"]
     return "interval" if outside or long > LARGEST_SKEW * short else "sd"
-
-
-def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
-    draws = posterior.draws[..., i].ravel()
-    lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
-    return {
-        "value": median,
-        "sd": np.std(draws, ddof=1),
-        "basis": "sample",
-        "mean": np.mean(draws),
-        "median": median,
-        "lower": lower,
-        "upper": upper,
-        "ess": posterior.ess[i],
-        "ess_bulk": posterior.ess_bulk[i],
-        "ess_tail": posterior.ess_tail[i],
-        "rhat": posterior.rhat[i],
-    }

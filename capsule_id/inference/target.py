@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -17,11 +16,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, Start, Unavailable, ValuesBySymbol
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
-from capsule_id.precision import COMPILE
 from capsule_id.rig.model import Rig
-
-#: Rows that are evaluated together where each takes more than this work, in readings: more would leave the caches.
-ROWS_TOGETHER, HEAVY = 8, 30_000
 
 # scales: Scatters of which only the product with other parameters changes the motion.
 
@@ -115,11 +110,6 @@ def prior_sd(row: Parameter) -> float:
     if prior.kind == "positive_normal":
         return prior.spread / prior.location
     return prior.spread
-
-
-def override(row: Parameter, stated: Prior | None) -> Parameter:
-    """Return the row with the prior of ``rig.toml``, where one is stated."""
-    return row if stated is None else row.named(row.of, stated)
 
 
 def covering_prior(name: str, priors: Sequence[Prior]) -> Prior:
@@ -220,7 +210,7 @@ def _group(experiments: Sequence[Experiment], members: Sequence[int], place: Map
     own = [{row.symbol: row.name for row in e.parameters} for e in experiments]
     sampled = [*dict.fromkeys(s for table in own for s in table), *(m for m in first.masses if m in place)]
     entries = tuple((s, tuple(place.get(table.get(s, s), len(place)) for table in own)) for s in sampled)
-    stacked = jax.tree.map(_stack, *experiments)
+    stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves).astype(float)), *experiments)
     # The stack has the static fields of its first member; no likelihood may read its table.
     object.__setattr__(stacked, "about", Unavailable())
     return Group(stacked, tuple(members), entries)
@@ -238,10 +228,6 @@ def _check_leaves(experiment: Experiment) -> None:
         if np.asarray(leaf).dtype.kind not in "fiu":
             field = f"{type(experiment).__name__}{jax.tree_util.keystr(path)}"
             raise TypeError(f"{field} must be a number, found {leaf!r}: declare it with eqx.field(static=True)")
-
-
-def _stack(*leaves: Any) -> jax.Array:
-    return jnp.asarray(np.stack([np.asarray(leaf, dtype=float) for leaf in leaves]))
 
 
 # log posterior: Joint log-posterior of all experiments in an unconstrained space.
@@ -305,9 +291,10 @@ class LogPosterior(eqx.Module):
             for row in experiment.parameters:
                 offered.setdefault(row.name, []).append(row)
         for name, (row, *others) in offered.items():
-            if others and name not in rig.priors:
-                row = row.named(row.of, covering_prior(name, [prior_of(one) for one in (row, *others)]))
-            rows.setdefault(name, override(row, rig.priors.get(name)))
+            prior = rig.priors.get(name)
+            if others and prior is None:
+                prior = covering_prior(name, [prior_of(one) for one in (row, *others)])
+            rows.setdefault(name, row if prior is None else row.named(row.of, prior))
         self.origin = Origin(rig, tuple(experiments), tuple(rows.values()), fixed)
         self.names = tuple(rows)
         self.are_positive = tuple(row.positive for row in rows.values())
@@ -360,6 +347,11 @@ class LogPosterior(eqx.Module):
         return np.flatnonzero(~self.scatter)
 
     @property
+    def kinked(self) -> bool:
+        """Whether scatters act together: residuals have kinks in the parameters there, and derivatives say little."""
+        return any(e.has_joint_scatters for e in self.experiments)
+
+    @property
     def scaled(self) -> list[Scale]:
         """Each scatter of which only the product with other parameters changes the motion."""
         scaled, balanced = dict[str, set[str]](), dict[str, set[str]]()
@@ -410,40 +402,23 @@ class LogPosterior(eqx.Module):
 
     # -- densities and residuals --------------------------------------------------------------------------------------
 
-    def log_prior(self, u: Any) -> Any:
-        """Normalised log prior density of u (d,), Jacobian included; scalar."""
-        return jnp.sum(self.priors.terms(u, self.constrain(u)))
-
-    def log_likelihood(self, u: Any) -> Any:
-        """Sum of the log-likelihoods of the experiments at u (d,); scalar."""
-        return sum(jnp.sum(part) for part in self._per_group(lambda e, theta: e.log_likelihood(theta), u))
-
-    def __call__(self, u: Any) -> Any:
-        """log p(u | data) up to the evidence, u (d,); -inf where it is not finite (an overdamped decay)."""
-        value = self.log_prior(u) + self.log_likelihood(u)
-        return jnp.where(jnp.isfinite(value), value, -jnp.inf)
-
-    def batch(self, u: Any) -> Any:
-        """Compiled log-posterior of a batch, (w, d) -> (w,). Fits use ``marginal.density_of``."""
-        return _batch(self, u)
-
     def residuals(self, u: Any) -> Any:
         """Residuals (n,) of all experiments and priors: the least-squares part of -log posterior."""
-        parts = self._per_group(lambda e, theta: e.residuals(theta), u)
-        return jnp.concatenate([*(jnp.ravel(part) for part in parts), self.priors.residuals(u, self.constrain(u))])
+        values = self.constrain(u)
+        parts = [jax.vmap(self._residuals_of)(group.experiments, group.local(values)) for group in self.groups]
+        return jnp.concatenate([*(jnp.ravel(part) for part in parts), self.priors.residuals(u, values)])
 
     def linearised(self, u: Any) -> tuple[Any, Any]:
         """Residuals (n,) as in ``residuals``, and their Jacobian (n, l) with respect to the l located entries of u."""
         values, located = self.constrain(u), self.located
         rates = jnp.where(self.positive, values, 1.0)
-
-        def one(experiment: Experiment, theta: ValuesBySymbol) -> Any:
-            return experiment.residuals({**theta, **self.constants})
-
-        parts = [group.linearised(one, values, rates, located) for group in self.groups]
+        parts = [group.linearised(self._residuals_of, values, rates, located) for group in self.groups]
         slopes = jnp.diag(self.priors.rates(rates))[:, located]
         residuals = [*(jnp.ravel(part) for part, _ in parts), self.priors.residuals(u, values)]
         return jnp.concatenate(residuals), jnp.concatenate([*(j.reshape(-1, len(located)) for _, j in parts), slopes])
+
+    def _residuals_of(self, experiment: Experiment, theta: ValuesBySymbol) -> Any:
+        return experiment.residuals({**theta, **self.constants})
 
     def residual_owners(self, u: np.ndarray, plain: bool = False) -> list[Experiment | None]:
         """(n,) experiment of every entry of ``residuals``, or of ``plain_residuals``, at u (d,); None: a prior."""
@@ -467,21 +442,6 @@ class LogPosterior(eqx.Module):
         """Time of an evaluation in units of that of one reading; 1 where it integrates motions of the capsule."""
         motions = any(e.event_driven for e in self.experiments)
         return 1 if motions else max(1, sum(e.work for e in self.experiments))
-
-    def by_rows(self, function: Callable[..., Any], *columns: Any) -> Any:
-        """``function`` of every row of ``columns`` (w, ...); where a row takes long, of a few rows at a time."""
-        if self.work < HEAVY:
-            return jax.vmap(function)(*columns)
-        return jax.lax.map(lambda row: function(*row), columns, batch_size=ROWS_TOGETHER)
-
-    def _per_group(self, function: Callable[[Experiment, ValuesBySymbol], Any], u: Any) -> list[Any]:
-        """Evaluate ``function`` for every experiment, batched: one array (members, ...) per group."""
-        values = self.constrain(u)
-
-        def one(experiment: Experiment, theta: ValuesBySymbol) -> Any:
-            return function(experiment, {**theta, **self.constants})
-
-        return [jax.vmap(one)(group.experiments, group.local(values)) for group in self.groups]
 
     # -- starts and prior samples ---------------------------------------------------------------------------------
 
@@ -517,25 +477,3 @@ class LogPosterior(eqx.Module):
     def sample_prior(self, rng: np.random.Generator, size: int) -> dict[str, np.ndarray]:
         """Return ``size`` prior draws of every parameter, SI."""
         return {row.name: prior_of(row).sample(rng, size) for row in self.parameters}
-
-
-@partial(jax.jit, compiler_options=COMPILE)
-def _batch(target: LogPosterior, u: Any) -> Any:
-    return target.by_rows(target, u)
-
-
-class HeldResiduals(eqx.Module):
-    """``LogPosterior.residuals`` as a function of the located entries of u; the others are fixed at ``centre``."""
-
-    target: LogPosterior
-    centre: Any
-
-    def __call__(self, v: Any) -> Any:
-        return self.target.residuals(self._whole(v))
-
-    def linearised(self, v: Any) -> tuple[Any, Any]:
-        """Residuals (n,) and their Jacobian (n, l) at v (l,)."""
-        return self.target.linearised(self._whole(v))
-
-    def _whole(self, v: Any) -> Any:
-        return self.centre.at[jnp.array(self.target.located)].set(v)

@@ -17,9 +17,11 @@ from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.inference.marginal import density_of
 from capsule_id.inference.target import LogPosterior
 from tests.cli_tools import DATA
 from tests.forced_runs import NOISE, TRUTH, recorded
+from tests.inference.stub import log_prior
 from tests.scipy_capsule import simulate_scipy
 
 pytestmark = pytest.mark.benchmark
@@ -73,15 +75,15 @@ def test_a_walker_of_bench_and_four_runs() -> None:
     # As far from each other as the walkers of the posterior: a part in a thousand.
     walkers = u + 1e-3 * np.random.default_rng(0).standard_normal((WALKERS, len(u))) * target.positive
     walkers[0] = u
-    density = np.asarray(target.batch(walkers))
+    density = np.asarray(density_of(target)(walkers))
     values = target.mapping(target.theta(u))
     ours, theirs = [], []
     for _ in range(ROUNDS):
         begin = time.perf_counter()
-        np.asarray(target.batch(walkers))
+        np.asarray(density_of(target)(walkers))
         ours.append((time.perf_counter() - begin) / WALKERS)
         begin = time.perf_counter()
-        own = float(target.log_prior(u))
+        own = log_prior(target, u)
         for e in target.experiments:
             local = e.local(values)
             own += density_of_run(e, local) if isinstance(e, ForcedRun) else float(e.log_likelihood(local, np))

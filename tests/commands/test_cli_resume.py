@@ -56,7 +56,7 @@ def here(uninterrupted: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def shorten(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("capsule_id.inference.ensemble.SAVE_EVERY", 0.0)
+    patch.setattr("capsule_id.inference.moves.SAVE_EVERY", 0.0)
     for name, value in SHORT.items():
         patch.setattr(f"capsule_id.inference.sampling.{name}", value)
 
@@ -176,7 +176,7 @@ def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPa
 def test_killed_from_outside_and_resumed(here: Path) -> None:
     """SIGKILL at a real process: nothing of Python runs after it."""
     kill = "import os, signal\nfrom capsule_id.console import Progress\n"
-    kill += "from capsule_id.inference import ensemble, sampling\nensemble.SAVE_EVERY = 0.0\n"
+    kill += "from capsule_id.inference import moves, sampling\nmoves.SAVE_EVERY = 0.0\n"
     kill += "".join(f"sampling.{name} = {value}\n" for name, value in SHORT.items())
     kill += "call = lambda self, done, total, text: done > 100 and os.kill(os.getpid(), signal.SIGKILL)\n"
     kill += "Progress.__call__ = call\n"

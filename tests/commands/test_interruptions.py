@@ -21,7 +21,7 @@ from tests.cli_tools import DATA, argv, environment, same_result, small_rig
 #: Longest time between a signal and the end of the process, s.
 LONGEST = 5.0
 #: A fit of a few seconds that saves its chains after every draw.
-SHORT = "from capsule_id.inference import ensemble, sampling\nensemble.SAVE_EVERY = 0.0\n"
+SHORT = "from capsule_id.inference import moves, sampling\nmoves.SAVE_EVERY = 0.0\n"
 SHORT += "sampling.FIRST_CHECK, sampling.CHECK_EVERY, sampling.PILOT_STEPS = 15, 15, 60\n"
 #: The step that starts the first ensemble hangs; the time until the process is ended is short.
 HANGING = "import time\nfrom capsule_id import console\nfrom capsule_id.inference import sampling\n"

@@ -8,7 +8,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.cli import capsule_id, fit_params
-from capsule_id.inference import refinement
+from capsule_id.inference import proposal as refinement
 from capsule_id.inference import sampling as ensembles
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])

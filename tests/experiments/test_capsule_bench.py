@@ -16,7 +16,7 @@ from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_free_decay
 from capsule_id.experiments.friction import unit_law
 from capsule_id.experiments.kind import default_registry
-from capsule_id.inference.point_stage import PointStage, fit_points
+from capsule_id.inference.point_stage import SampledFit, fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.physics.friction import slide_distance
@@ -54,14 +54,14 @@ def pushes(forward: str, speeds: np.ndarray = SPEEDS) -> Table:
 
 
 @cache
-def fitted(release: float, forward: str) -> PointStage:
+def fitted(release: float, forward: str) -> SampledFit:
     known = {"mu": Prior("lognormal", MU, 1.02), "v_s": Prior("lognormal", V_S, 1.1)}
     table = decay(release, forward)
     rig = bench.rig(table, priors=known)
     return fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False)
 
 
-def estimate(stage: PointStage, name: str) -> tuple[float, float]:
+def estimate(stage: SampledFit, name: str) -> tuple[float, float]:
     return stage.fit.values[name], stage.fit.standard_errors[name]
 
 

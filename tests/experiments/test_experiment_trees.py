@@ -19,10 +19,10 @@ from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.inference import target as log_posterior
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.verdict import run_checks
+from capsule_id.inference.marginal import conditional, density_of
 from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.tables import make_notes
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
@@ -104,15 +104,15 @@ def test_log_posteriors_of_many_rigs_share_one_program(tmp_path: Path) -> None:
         target = LogPosterior(rig, make_experiments(rig))
         start = target.starts()
         u = target.unconstrain(np.array([start[name].centre for name in target.names]))
-        values.append(float(target.batch(u[None])[0]))
-        sizes.append(log_posterior._batch._cache_size())
+        values.append(float(density_of(target)(u[None])[0]))
+        sizes.append(conditional._cache_size())
     assert sizes[0] == sizes[1] == sizes[2]
     assert len(set(values)) == 3
     # Negative control: another damping model is another structure.
     others = [e.with_model(DecayModel(("dry",))) if isinstance(e, FreeVibration) else e for e in make_experiments(rig)]
     other = LogPosterior(rig, others)
-    other.batch(np.zeros((1, other.dimension)))
-    assert log_posterior._batch._cache_size() == sizes[0] + 1
+    density_of(other)(np.zeros((1, other.dimension)))
+    assert conditional._cache_size() == sizes[0] + 1
 
 
 def check_balance(members: Sequence["Weighing"], fit: Fitted) -> list[Finding]:
@@ -181,7 +181,7 @@ def test_a_likelihood_cannot_read_the_table_of_one_member() -> None:
     first = decay(1)
     target = LogPosterior(first.rig, [ReadsItsTable(first.table, first.rig)])
     with pytest.raises(AttributeError, match="a likelihood must not read table"):
-        target.log_likelihood(jnp.zeros(target.dimension))
+        density_of(target)(np.zeros((1, target.dimension)))
 
 
 def test_a_leaf_that_is_no_number_is_named() -> None:

@@ -11,9 +11,9 @@ from capsule_id.experiments.forced_run.start_state import rough_start
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity
-from tests.capsule_cases import jit_quickly
 from tests.experiments import bench
 from tests.forced_runs import NOISE, SAMPLES, channels, make, recorded, table, theta
+from tests.inference.stub import log_likelihood
 
 
 def density(observed: np.ndarray, predicted: np.ndarray, covariance: np.ndarray, gain_sd: float = 0.0) -> float:
@@ -93,7 +93,7 @@ def test_runs_of_both_kinds_of_start_are_one_group_and_add_up() -> None:
     u = u + 1e-3 * np.abs(u) * rng.standard_normal(len(u))
     values = target.mapping(target.theta(u))
     expected = sum(float(run.log_likelihood(run.local(values), np)) for run in runs)
-    assert float(jit_quickly(lambda u: target.log_likelihood(u))(u)) == pytest.approx(expected, rel=1e-10)
+    assert log_likelihood(target, u) == pytest.approx(expected, rel=1e-10)
 
 
 def test_a_settled_run_starts_on_the_motion_that_it_settles_on_from_rest() -> None:

@@ -17,7 +17,8 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.experiments.static_friction import StaticFriction
-from capsule_id.inference.ensemble import ChainStore
+from capsule_id.inference.marginal import density_of
+from capsule_id.inference.moves import ChainStore
 from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
@@ -162,7 +163,7 @@ def test_eq_1_named_explicitly_is_the_default() -> None:
     plain, named = (LogPosterior(rig, make_experiments(rig, friction=law)) for law in (None, CoulombStribeck))
     assert plain.names == named.names == ("mu", "tilt_sd", "v_s", "push_scatter")
     u = np.log([[0.6, 0.01, 0.2, 0.02]])
-    assert float(plain.batch(u)[0]) == float(named.batch(u)[0])
+    assert float(density_of(plain)(u)[0]) == float(density_of(named)(u)[0])
 
 
 @jax.tree_util.register_dataclass

@@ -8,7 +8,7 @@ from capsule_id.experiments.forced_run import experiment as predictability
 from capsule_id.experiments.forced_run.checks import check_predictable
 from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, growth
-from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from tests.forced_runs import make, theta

@@ -16,9 +16,8 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.declaration import KIND
 from capsule_id.experiments.progression.density import INNER, NODES
 from capsule_id.experiments.progression.experiment import Progression, check_discrepancy
-from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.joint_fit import _rescaled
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.tables import check_engine
 from capsule_id.inference.target import LogPosterior
@@ -27,6 +26,7 @@ from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
+from capsule_id.synthetic import ROBOT, RobotDesign, synthesize_robot
 from tests.capsule_cases import jit_quickly
 from tests.experiments.summed_sessions import integrated
 from tests.rig.faults import fault_of

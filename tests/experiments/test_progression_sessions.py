@@ -29,8 +29,8 @@ from capsule_id.experiments.progression.density import (
     parameters_of,
 )
 from capsule_id.experiments.progression.experiment import Progression, session_table
-from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
 from capsule_id.inference.checks.settings import outliers
+from capsule_id.synthetic import RobotDesign, synthesize_robot
 from tests.experiments.summed_sessions import integrated, linear_misfit
 from tests.inference.three_settings import THETA, three_settings
 

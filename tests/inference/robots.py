@@ -9,10 +9,10 @@ import numpy as np
 
 import capsule_id as cid
 from capsule_id.api import read_rig
-from capsule_id.experiments.progression.twin import ROBOT, RobotDesign
 from capsule_id.inference.compare import Choice, compare_points
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling import DEFAULT_BUDGET
+from capsule_id.synthetic import ROBOT, RobotDesign
 from tests.inference.calibration import Outcome, normal_score
 
 #: Truths are log-uniform within this factor of the robot's twin.

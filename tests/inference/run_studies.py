@@ -13,7 +13,7 @@ from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.checks.posterior import check_agreement
-from capsule_id.inference.point_stage import PointStage, fit_points
+from capsule_id.inference.point_stage import SampledFit, fit_points
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.target import LogPosterior
 from capsule_id.synthetic import Truth, synthesize
@@ -77,15 +77,15 @@ def _edit(file: Path, change: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
     change(pd.read_csv(file)).to_csv(file, index=False)
 
 
-def named_by(stage: PointStage) -> str:
+def named_by(stage: SampledFit) -> str:
     """The parameter that the check of bench against runs names; "" where it passes."""
-    found = check_agreement(stage.target, stage.fit, stage.bench.fit, stage.bench.sample)[0]
+    found = check_agreement(stage)[0]
     if found.level == "ok":
         return ""
     return found.facts["distances"][0][0]
 
 
-def disagreement_of(folder: Path, seed: int, runs: Sequence[str] = ()) -> PointStage:
+def disagreement_of(folder: Path, seed: int, runs: Sequence[str] = ()) -> SampledFit:
     """The rig in ``folder`` fitted, bench and runs; of its ``runs`` only these, where named."""
     rig = read_rig(folder)
     kept = tuple(t for t in rig.tables if t.kind != "forced_run" or not runs or t.label in runs)

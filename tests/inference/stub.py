@@ -9,10 +9,28 @@ import numpy as np
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.inference.target import Scale
+from capsule_id.inference.marginal import density_of
+from capsule_id.inference.target import LogPosterior, Scale
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.views import Comparison
+
+
+def log_prior(target: LogPosterior, u: np.ndarray) -> float:
+    """Normalised log prior density of u (d,), Jacobian included."""
+    return float(jnp.sum(target.priors.terms(u, target.constrain(u))))
+
+
+def log_likelihood(target: LogPosterior, u: np.ndarray) -> float:
+    """Log-posterior of u (d,) without the priors, by the compiled program of the fit."""
+    return float(density_of(target)(np.asarray(u)[None])[0]) - log_prior(target, u)
+
+
+def log_posterior(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(w,) log-posterior of u (w, d) up to the evidence: every experiment alone, in NumPy."""
+    values = [target.mapping(target.theta(one)) for one in u]
+    parts = [sum(float(e.log_likelihood(e.local(one), np)) for e in target.experiments) for one in values]
+    return np.array([log_prior(target, one) + own for one, own in zip(u, parts, strict=True)])
 
 
 def rig_without_tables(priors: Mapping[str, Prior] | None = None) -> Rig:

@@ -12,9 +12,11 @@ from scipy import stats
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.inference import leave_out
+from capsule_id.inference import prediction as leave_out
 from capsule_id.inference.compare import variants_of
-from capsule_id.inference.leave_out import (
+from capsule_id.inference.marginal import density_of
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.prediction import (
     LARGEST_SHAPE,
     WeightedDraws,
     _bridge,
@@ -25,8 +27,6 @@ from capsule_id.inference.leave_out import (
     smoothed_weights,
     weighted_draws,
 )
-from capsule_id.inference.marginal import density_of
-from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.proposal import block_proposal
 from capsule_id.inference.sampling import Emulation, ExactMotions, Places
 from capsule_id.inference.target import LogPosterior
@@ -219,7 +219,7 @@ def test_the_evidence_of_a_bench_test_is_that_of_quadrature() -> None:
     target = LogPosterior(rig, make_experiments(rig))
     fit, density = point_fit(target, 0), density_of(target)
     draws = weighted_draws(target, fit, 0)
-    assert draws.log_weight.shape == (leave_out.DRAWS, 2)
+    assert draws.log_weight.shape == (leave_out.PROPOSED_DRAWS, 2)
     assert draws.block == {"k2[soft]": 0, "k2[stiff]": 1}
     rng, total = np.random.default_rng(0), 0.0
     for block in target.blocks:

@@ -16,12 +16,13 @@ from capsule_id.cli import fit_params
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
-from capsule_id.inference import compare, leave_out
+from capsule_id.inference import compare
+from capsule_id.inference import prediction as leave_out
 from capsule_id.inference.compare import Choice, _choose, _Variant, compare_models, compare_points
-from capsule_id.inference.leave_out import LeftOut, WeightedDraws
+from capsule_id.inference.prediction import LeftOut, WeightedDraws
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
+from capsule_id.synthetic import RobotDesign, synthesize_robot
 from tests.inference.three_settings import PERIODS, THETA, three_settings
 
 

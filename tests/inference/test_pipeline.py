@@ -19,7 +19,7 @@ from capsule_id.inference.pipeline import (
     sample_posterior,
     stage_seeds,
 )
-from capsule_id.inference.point_stage import PointStage, fit_points
+from capsule_id.inference.point_stage import SampledFit, fit_points
 from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.inference.target import LogPosterior
 from tests.cli_tools import small_rig
@@ -59,6 +59,6 @@ def test_stages_one_by_one_give_the_numbers_of_the_whole(tmp_path: Path) -> None
         np.testing.assert_array_equal(values, other.log_likelihood[label])
         np.testing.assert_array_equal(own.replicates[label], other.replicates[label])
     # Negative control: another seed gives another sample.
-    another = sample_posterior(cast(PointStage, point), stage_seeds(4).walkers, BUDGET)
+    another = sample_posterior(cast(SampledFit, point), stage_seeds(4).walkers, BUDGET)
     draws = [cast(Posterior, each.posterior).draws for each in (another, result)]
     assert not np.array_equal(*draws)

@@ -10,10 +10,10 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
-from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, robot_progression, synthesize_robot
 from capsule_id.inference.prediction import predict
 from capsule_id.inference.result import Result
 from capsule_id.report.figures.fits import side_by_side
+from capsule_id.synthetic import ROBOT, RobotDesign, robot_progression, synthesize_robot
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
 DESIGN = RobotDesign(PERIODS, np.full(3, 0.3), sessions=3, session_sd=0.05, trial_sd=1e-3)

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.api import read_rig
-from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.rig.model import Rig
+from capsule_id.synthetic import ROBOT, RobotDesign, synthesize_robot
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
 #: Values of the parameters of the progression by symbol.

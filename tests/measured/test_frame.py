@@ -8,9 +8,9 @@ from scipy.optimize import least_squares
 
 from capsule_id.experiments.forced_run.drives import BaseRun
 from capsule_id.experiments.friction_model import FrictionModel
-from capsule_id.inference.checks.settings import SampledFit
-from capsule_id.inference.checks.widening import record_widenings
+from capsule_id.inference.checks.verdict import record_widenings
 from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.records.motion import measured_motion

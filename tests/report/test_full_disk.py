@@ -15,7 +15,7 @@ import pytest
 from capsule_id.cli import capsule_id, fit_params
 from capsule_id.commands import compilation
 from capsule_id.errors import OutputError
-from capsule_id.inference.ensemble import ChainStore
+from capsule_id.inference.moves import ChainStore
 from capsule_id.inference.result import Result
 from capsule_id.motions import sweep
 from capsule_id.report.write import result_files, write_result
@@ -176,7 +176,7 @@ def test_a_fault_at_every_operation_of_a_fit(
 ) -> None:
     small_rig(tmp_path / "rig")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("capsule_id.inference.ensemble.SAVE_EVERY", np.inf)  # the operations are then the same
+    monkeypatch.setattr("capsule_id.inference.moves.SAVE_EVERY", np.inf)  # the operations are then the same
     words = (*WORDS, "--out", "out", "--no-cache")
     assert fit_params([*WORDS, "--out", "whole", "--no-cache"]) == 0
     moment, refused = 0, 0

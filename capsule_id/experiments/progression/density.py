@@ -302,8 +302,8 @@ class TrialGroups(eqx.Module):
     log_share : (alternatives,) logarithm of the prior probability within the setting
     setting : (alternatives,) index of the setting, in ascending order
     case : (k,) case of the trials, as in ``Sessions``; an alternative has all cases of its setting
-    trials, count, mean, spread : (k,) number of trials, sum of their weights, weighted mean, m, and sum of squares, m^2
-    measure : (k,) sum of the logarithms of ``variance``
+    sums : (5, k) weighted mean, m, number of trials, sum of their weights, sum of squares, m^2, sum of the logarithms of
+        ``variance``
     known, filled : (alternatives, g) index of what is known of an alternative, and 1 where there is one; else any index
     lone : index of the others: of those alone in their setting, apart from known ones, and of those that share it
     of_alternative : for both, (k, alternatives) 1 where it belongs to an alternative
@@ -313,11 +313,7 @@ class TrialGroups(eqx.Module):
     log_share: np.ndarray
     setting: np.ndarray
     case: np.ndarray
-    trials: np.ndarray
-    count: np.ndarray
-    mean: np.ndarray
-    spread: np.ndarray
-    measure: np.ndarray
+    sums: np.ndarray
     known: np.ndarray
     filled: np.ndarray
     lone: tuple[np.ndarray, np.ndarray]
@@ -330,10 +326,10 @@ class TrialGroups(eqx.Module):
         self.variance, self.log_share, self.setting = alternatives(membership, heavy)
         alternative, self.case = np.nonzero(self.setting[:, None] == sessions.setting)
         rows, weight = sessions.rows.T[self.case], 1.0 / self.variance[alternative]
-        self.trials, self.count = np.sum(rows, axis=1), np.sum(rows * weight, axis=1)
-        self.mean = np.sum(rows * weight * distance, axis=1) / self.count
-        self.spread = np.sum(rows * weight * (distance - self.mean[:, None]) ** 2, axis=1)
-        self.measure = np.sum(rows * np.log(self.variance[alternative]), axis=1)
+        count, measure = np.sum(rows * weight, axis=1), np.sum(rows * np.log(self.variance[alternative]), axis=1)
+        mean = np.sum(rows * weight * distance, axis=1) / count
+        spread = np.sum(rows * weight * (distance - mean[:, None]) ** 2, axis=1)
+        self.sums = np.stack([mean, np.sum(rows, axis=1), count, spread, measure])
         alone, shared = sessions.alone[self.case], sessions.shared[self.case]
         each = np.arange(len(self.setting))
         known = [np.flatnonzero((alternative == b) & (alone == 0.0)) for b in each]
@@ -454,9 +450,7 @@ class TrialMisfit:
     def _cases(self, index: Any, xp: ModuleType) -> tuple[Any, ...]:
         """``X2`` (..., nodes), mean, number, sum of weights, spread and measure of ``index`` (...)."""
         index = xp.asarray(index).astype(int)  # The log-posterior stores all numbers of experiments as floats.
-        groups = self.groups
-        of_cases = (groups.mean, groups.trials, groups.count, groups.spread, groups.measure)
-        return self.X2[xp.asarray(groups.case).astype(int)[index]], *(xp.asarray(x)[index] for x in of_cases)
+        return self.X2[xp.asarray(self.groups.case).astype(int)[index]], *xp.asarray(self.groups.sums)[:, index]
 
     def _of_lone_sessions(self, shared: int, scatter: Any, discrepancy: tuple[Any, Any], xp: ModuleType) -> Any:
         """(scatter, alternatives) density of the trials whose z is integrated out.

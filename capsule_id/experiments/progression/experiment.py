@@ -1,6 +1,6 @@
 """Likelihood of progressions: displacement of the capsule after a number of drive periods, from rest."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, cast
@@ -203,7 +203,8 @@ class Progression(CapsuleForward):
         settings, index = np.unique(rows, axis=0, return_inverse=True)
         setting, session = np.eye(len(settings))[index], sessions_of(table, rows)
         self.heavy = table.settings.tails == "heavy"
-        for name, value in self._cases(table["distance"], settings, setting, session, parameters_of(setting, session)):
+        parameter = parameters_of(setting, session)
+        for name, value in self._cases(table["distance"], settings, setting, session, parameter).items():
             setattr(self, name, value)
         stated = getattr(table.settings, AMPLITUDE[self.drive])
         self.force = stated.value if stated is not None and stated.sd == 0.0 else 0.0
@@ -218,15 +219,19 @@ class Progression(CapsuleForward):
         setting: np.ndarray,
         session: np.ndarray,
         parameter: np.ndarray,
-    ) -> Iterable[tuple[str, Any]]:
-        """Name and value of every field that depends on which trials there are."""
+    ) -> dict[str, Any]:
+        """Every field that depends on which trials there are, by name."""
         sessions = Sessions(setting, session, parameter)
-        yield from {"distance": distance, "settings": settings, "setting": setting}.items()
-        yield from {"session": session, "parameter": parameter, "sessions": sessions}.items()
-        yield from {
+        return {
+            "distance": distance,
+            "settings": settings,
+            "setting": setting,
             "time": settings[:, 0] * settings[:, 1],
+            "session": session,
+            "parameter": parameter,
+            "sessions": sessions,
             "groups": TrialGroups(distance, sessions, self.heavy),
-        }.items()
+        }
 
     def _sampled(self, lag: list[Parameter]) -> tuple[Parameter, ...]:
         settings, free = self.table.settings, self.rig.model.free
@@ -466,9 +471,7 @@ class Progression(CapsuleForward):
         kept = self.setting[:, setting] == 0.0
         some = self.session[kept].any(axis=0)
         settings, setting_of = np.delete(self.settings, setting, axis=0), np.delete(self.setting[kept], setting, axis=1)
-        left = dict(
-            self._cases(self.distance[kept], settings, setting_of, self.session[kept][:, some], self.parameter[some])
-        )
+        left = self._cases(self.distance[kept], settings, setting_of, self.session[kept][:, some], self.parameter[some])
         fields = (*left, "emulator")
         return eqx.tree_at(
             lambda e: [getattr(e, name) for name in fields], self, [*left.values(), None], is_leaf=lambda x: x is None

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 from scipy.fft import dct
@@ -15,13 +14,13 @@ from scipy.ndimage import gaussian_filter1d
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.lint import WRONG_PREFIX
-from capsule_id.inference.checks.settings import DIFFERENCE, SMALLEST_SCATTER, SampledFit, moving_symbols
-from capsule_id.inference.curvature import jacobian
+from capsule_id.inference.checks.settings import SMALLEST_SCATTER, design
 from capsule_id.inference.least_squares import linearised
-from capsule_id.inference.leave_out import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.moves import geyer_size
+from capsule_id.inference.point_stage import SampledFit
+from capsule_id.inference.prediction import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.result import PointFit, Pointwise, Posterior
-from capsule_id.inference.target import HeldResiduals, LogPosterior, prior_of
+from capsule_id.inference.target import LogPosterior, prior_of
 from capsule_id.parameters import Parameter, is_stated
 from capsule_id.views import Finding
 
@@ -46,7 +45,7 @@ class RunsAlone:
 def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
     """Estimate from runs and priors: one Gauss–Newton step from the joint ``fit`` without bench residuals."""
     located = target.located
-    misses, jacobian = linearised(HeldResiduals(target, jnp.asarray(fit.u)), fit.u[located])
+    misses, jacobian = linearised(target, fit.u, fit.u[located])
     rows = np.array([owner is None or not owner.bench for owner in target.residual_owners(fit.u)])
     kept = jacobian[rows]
     covariance = np.linalg.inv(kept.T @ kept)
@@ -99,39 +98,30 @@ def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
     levels = np.array([0.005, 0.05]) if below < 0.5 else np.array([0.995, 0.95])
     centre = float(np.median(draws))
     outer, inner = np.abs(np.quantile(draws, levels) - centre)
-    freedom = _freedom(outer / inner)
+    grid = np.geomspace(1.0, 1e3, 200)
+    freedom = float(grid[np.argmin(np.abs(stats.t.isf(0.005, grid) / stats.t.isf(0.05, grid) - outer / inner))])
     scale = outer / stats.t.isf(0.005, freedom)
     tail = stats.t.logsf(abs(value - centre) / scale, freedom)
-    return float(np.copysign(_quantile_of_log_tail(float(tail)), laplace))
-
-
-def _freedom(ratio: float) -> float:
-    """Degrees of freedom of a Student t whose 0.5 % and 5 % points have this ``ratio``."""
-    grid = np.geomspace(1.0, 1e3, 200)
-    return float(grid[np.argmin(np.abs(stats.t.isf(0.005, grid) / stats.t.isf(0.05, grid) - ratio))])
-
-
-def _quantile_of_log_tail(log_tail: float) -> float:
-    """z with log(1 - Phi(z)) = ``log_tail``, also where the tail itself underflows."""
+    # z with the same log(1 - Phi(z)), also where the tail itself underflows.
     z = np.linspace(0.0, 40.0, 8001)
-    return float(np.interp(-log_tail, -stats.norm.logsf(z), z))
+    return float(np.copysign(np.interp(-tail, -stats.norm.logsf(z), z), laplace))
 
 
-def check_agreement(
-    target: LogPosterior, joint: PointFit, bench: PointFit | None, sample: Posterior | None
-) -> list[Finding]:
+def check_agreement(s: SampledFit) -> list[Finding]:
     """Check that bench tests and runs are consistent (two-sided, Šidák over the shared parameters).
 
     Masses are excluded, because both estimates contain their weighings.
     """
-    known = {row.name for e in target.experiments if not e.bench for row in e.parameters}
-    shared = [] if bench is None else [name for name in bench.names if name in known]
-    found = disagreement(shared, runs_alone(target, joint), bench, sample) if bench is not None and shared else {}
+    known = {row.name for e in s.experiments if not e.bench for row in e.parameters}
+    shared = [] if s.bench is None else [name for name in s.bench.names if name in known]
+    if s.bench is None or not shared:
+        return []
+    found = disagreement(shared, runs_alone(s.target, s.fit), s.bench, s.bench_sample)
     tests = {
-        name: [e.label for e in target.experiments if e.bench and name in {row.name for row in e.parameters}]
+        name: [e.label for e in s.experiments if e.bench and name in {row.name for row in e.parameters}]
         for name in found
     }
-    return [agreement(found, sample is not None, tests)] if found else []
+    return [agreement(found, s.bench_sample is not None, tests)]
 
 
 def agreement(
@@ -351,13 +341,12 @@ def in_doubt(s: SampledFit) -> set[str]:
 
 def check_priors(s: SampledFit) -> list[Finding]:
     """Check every stated prior, weighing and default prior of a physical parameter against the rest of the data."""
-    findings = []
-    found = conflicts(s)
-    scatters = {row.name for row in s.target.parameters if default_scatter(s, row)}
+    findings, found = [], conflicts(s)
     for name, conflict in found.items():
         p = float(2.0 * stats.norm.sf(abs(conflict.z)))
-        if p * len(found) < LEVEL or (name in scatters and conflict.z > PRIOR_PULL):
-            findings.append(_finding(s, name, conflict, p))
+        row = s.target.parameters[s.target.names.index(name)]
+        if p * len(found) < LEVEL or (default_scatter(s, row) and conflict.z > PRIOR_PULL):
+            findings.append(_finding(s, row, conflict, p))
     return findings or [Finding("priors.conflict", "ok", {"number": len(found)})]
 
 
@@ -372,9 +361,9 @@ def _location(s: SampledFit) -> tuple[np.ndarray, np.ndarray]:
     return np.median(x, axis=0), np.std(x, axis=0)
 
 
-def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
-    """The conflict of parameter ``name``; it concerns all parameters of the experiments that read it."""
-    (row,) = [row for row in s.target.parameters if row.name == name]
+def _finding(s: SampledFit, row: Parameter, conflict: Conflict, p: float) -> Finding:
+    """The conflict of one parameter; it concerns all parameters of the experiments that read it."""
+    name = row.name
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
     prior = prior_of(row)
     unit = (
@@ -417,26 +406,12 @@ PREDICTIVE_LEVEL = 0.002
 SLOWEST = 3
 
 
-def sign_runs(r: np.ndarray) -> np.ndarray:
-    """Minus the number of sign changes along each row of (m, n): long runs of one sign are large."""
-    return -np.sum(np.signbit(r[:, 1:]) != np.signbit(r[:, :-1]), axis=1).astype(float)
-
-
-def largest(r: np.ndarray) -> np.ndarray:
-    """Largest absolute residual of each row of (m, n), studentised ones."""
-    return np.max(np.abs(r), axis=1)
-
-
-def trend(r: np.ndarray) -> np.ndarray:
-    """Power of each row of (m, n) in its ``SLOWEST`` cosines, the constant left out."""
-    cosines = np.asarray(dct(r, axis=1, norm="ortho"))
-    return np.sum(cosines[:, 1 : 1 + SLOWEST] ** 2, axis=1)
-
-
+#: Statistics of each row of residuals (m, n): minus the number of sign changes, so that long runs of one sign are large; the
+#: largest size of studentised ones; the power in the ``SLOWEST`` cosines, the constant left out.
 STATISTICS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
-    "sign runs": sign_runs,
-    "largest": largest,
-    "trend": trend,
+    "sign runs": lambda r: -np.sum(np.signbit(r[:, 1:]) != np.signbit(r[:, :-1]), axis=1).astype(float),
+    "largest": lambda r: np.max(np.abs(r), axis=1),
+    "trend": lambda r: np.sum(np.asarray(dct(r, axis=1, norm="ortho"))[:, 1 : 1 + SLOWEST] ** 2, axis=1),
 }
 
 
@@ -473,7 +448,7 @@ def p_values(residuals: np.ndarray, columns: np.ndarray, seed: int = 0) -> dict[
 
 def experiment_p_values(e: Experiment, theta: Mapping[str, float]) -> dict[str, float]:
     """The p-values of one bench test at ``theta``; {} where too few residuals are free or they are rounding."""
-    residuals, columns = _linearised(e, theta)
+    residuals, columns = design(e, theta)
     if len(residuals) - columns.shape[1] < FEWEST_FREE or np.std(residuals) <= SMALLEST_SCATTER:
         return {}
     # Rows of a calibration line or of slides may have any order: they follow their abscissa.
@@ -487,20 +462,6 @@ def experiment_p_values(e: Experiment, theta: Mapping[str, float]) -> dict[str, 
             return {}
     found = p_values(residuals[order], columns[order])
     return {name: p for name, p in found.items() if name != "trend" or not e.explains_trend}
-
-
-def _linearised(e: Experiment, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (n,) at the conditional mean of the nuisances; effect (n, p) of parameters and nuisances on them."""
-    symbols = moving_symbols(e)
-
-    def residuals(v: np.ndarray) -> np.ndarray:
-        return np.asarray(e.residuals({**theta, **dict(zip(symbols, v, strict=True))}, np))[: e.n]
-
-    misfit, at = e.misfit(theta), np.array([float(theta[symbol]) for symbol in symbols])
-    effects = jacobian(residuals, at, DIFFERENCE * np.maximum(np.abs(at), 1e-12)) if symbols else np.zeros((e.n, 0))
-    columns = np.concatenate([effects, misfit.design / misfit.sd[:, None]], axis=1)
-    size = np.linalg.norm(columns, axis=0)
-    return residuals(at), columns[:, size > 0.0] / size[size > 0.0]
 
 
 def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding]:

@@ -1,136 +1,19 @@
 """Checks of residuals against settings and order, outliers, and parameters that two groups share."""
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize, stats
-from scipy.optimize import minimize
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.checks import autocorrelation, estimate, refit
-from capsule_id.experiments.context import Tension
 from capsule_id.experiments.friction import varies
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.point_fit import residual_jacobian
-from capsule_id.inference.point_stage import BenchFit
-from capsule_id.inference.result import PointFit, Posterior
-from capsule_id.inference.target import LogPosterior
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.parameters import is_stated
-from capsule_id.rig.model import Rig
 from capsule_id.views import Facts, Finding
-
-# tension: Likelihood-ratio test of a parameter that two groups of experiments share (friction: tilts and slides).
-
-
-def tension(rig: Rig, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
-    """Likelihood-ratio test that two groups of experiments share their parameters (one shared parameter: mu).
-
-    Priors regularise both fits (a scatter from four trials needs one). They enter without their normalisation, so that
-    a second copy of a vague prior does not change the statistic.
-    """
-    joint, *apart = (_maximum(LogPosterior(rig, group)) for group in ([*one, *other], one, other))
-    statistic = max(2.0 * (apart[0][0] + apart[1][0] - joint[0]), 0.0)
-    return Tension(statistic, float(stats.chi2.sf(statistic, 1)), apart[0][1], apart[1][1])
-
-
-def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
-    """Largest penalised log-likelihood and its parameters, by name; NumPy suffices for a few readings."""
-    proposed = target.starts()
-    start = target.unconstrain(np.array([proposed[name].centre for name in target.names]))
-    # The masses change only a steady force here, so they keep their measured values.
-    free = np.array([row.symbol not in ("m1", "m2") for row in target.parameters])
-
-    def objective(v: np.ndarray) -> float:
-        u = start.copy()
-        u[free] = v
-        values = target.mapping(target.theta(u))
-        likelihood = sum(float(e.log_likelihood(e.local(values), np)) for e in target.experiments)
-        penalty = 0.5 * float(np.sum(target.prior_residuals(u)[free] ** 2))
-        return penalty - likelihood
-
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        best = minimize(objective, start[free], method="BFGS", options={"gtol": 1e-6})
-    u = start.copy()
-    u[free] = best.x
-    return -float(best.fun), target.mapping(target.theta(u))
-
-
-# sampled fit: Data of a finished fit that checks and tables read.
-
-
-#: Largest factor of an sd beside which the fit still gives a number.
-LARGEST_FACTOR = 30.0
-
-
-@dataclass(frozen=True)
-class Widening:
-    """Error of the model of one parameter.
-
-    Attributes
-    ----------
-    factor : of its sd, at least 1
-    quantile : Student's t quantile over the normal one, for the ends of the 95 % interval
-    parts : number of parts of the data
-    """
-
-    factor: float
-    quantile: float
-    parts: int
-
-    @property
-    def stretch(self) -> float:
-        """Factor of the half-length of the 95 % interval."""
-        return self.factor * self.quantile
-
-    @property
-    def no_number(self) -> bool:
-        """Whether the parts contradict each other so far that the fit gives no number."""
-        return not self.factor <= LARGEST_FACTOR
-
-
-@dataclass(frozen=True)
-class SampledFit:
-    """A point fit, its sample (None where nothing was sampled) and its findings so far.
-
-    See ``capsule_id.experiments.base.Fitted``.
-
-    Attributes
-    ----------
-    bench : fit of the bench tests alone, where runs were fitted too
-    seed : seed of the starting points of further point fits
-    widened : error of the model by name of the parameter, where a check failed
-    """
-
-    target: LogPosterior
-    fit: PointFit
-    posterior: Posterior | None
-    values: Mapping[str, float]
-    draws: Sequence[Mapping[str, float]] = ()
-    seed: int = 0
-    flagged: Mapping[str, Sequence[int]] = field(default_factory=dict)
-    findings: Sequence[Finding] = ()
-    bench: BenchFit = field(default_factory=BenchFit)
-    widened: Mapping[str, Widening] = field(default_factory=dict)
-
-    @property
-    def rig(self) -> Rig:
-        return self.target.rig
-
-    @property
-    def experiments(self) -> tuple[Experiment, ...]:
-        return self.target.experiments
-
-    def tension(self, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
-        return tension(self.rig, one, other)
-
-    def correlation(self, names: Sequence[str]) -> np.ndarray:
-        if self.draws:
-            return np.atleast_2d(np.corrcoef([[draw[name] for draw in self.draws] for name in names]))
-        chosen = [self.target.names.index(name) for name in names]
-        sd = np.sqrt(np.diag(self.fit.covariance))[chosen]
-        return self.fit.covariance[np.ix_(chosen, chosen)] / np.outer(sd, sd)
-
 
 # regression: Outliers by local regression diagnostics of one experiment at the point fit.
 #
@@ -264,7 +147,7 @@ def check_order(s: SampledFit, by_load: Collection[str] = ()) -> list[Finding]:
     ----------
     by_load : tables whose residuals depend on the load: the order within a load is judged
     """
-    findings, tables = [], []
+    cases = []
     for e in s.experiments:
         if e.time_series:
             continue
@@ -275,14 +158,25 @@ def check_order(s: SampledFit, by_load: Collection[str] = ()) -> list[Finding]:
         if e.label in by_load:
             residuals = _within_loads(residuals, _loads(s, e)[0])
         if len(residuals) >= FEWEST_ROWS and np.std(residuals) > SMALLEST_SCATTER:
-            tables.append((e, residuals))
-    for e, residuals in tables:
-        correlation, p = lag_1(residuals)
-        if correlation > SMALLEST_CORRELATION and p * len(tables) < ORDER_LEVEL:
-            factor = np.sqrt((1.0 + correlation) / (1.0 - correlation))
-            facts = {"correlation": correlation, "rows": len(residuals), "p": p, "factor": float(factor)}
-            findings.append(Finding("trials.order", "fail", facts, e.label))
-    return findings or [Finding("trials.order", "ok", {"number": len(tables)})] * bool(tables)
+            correlation, p = lag_1(residuals)
+            factor = float(np.sqrt((1.0 + correlation) / (1.0 - correlation)))
+            facts = {"correlation": correlation, "rows": len(residuals), "p": p, "factor": factor}
+            cases.append((e.label, p if correlation > SMALLEST_CORRELATION else 1.0, facts))
+    return judged("trials.order", cases, ORDER_LEVEL, {"number": len(cases)})
+
+
+def judged(
+    code: str, cases: Sequence[tuple[str, float, Facts]], level: float, number: Facts | None = None
+) -> list[Finding]:
+    """Findings of one check of several experiments with this family-wise false-alarm rate (Bonferroni); [] without any.
+
+    Parameters
+    ----------
+    cases : label of the experiment, p-value and facts
+    number : facts of the finding where no case fails
+    """
+    failed = [Finding(code, "fail", facts, label) for label, p, facts in cases if p * len(cases) < level]
+    return failed or [Finding(code, "ok", number or {})] * bool(cases)
 
 
 def lag_1(residuals: np.ndarray, seed: int = 0) -> tuple[float, float]:
@@ -298,14 +192,25 @@ def lag_1(residuals: np.ndarray, seed: int = 0) -> tuple[float, float]:
 
 def check_tables(s: SampledFit) -> list[Finding]:
     """Check that tables with the same parameters agree: by their mean residuals, or, with offsets, by their slopes."""
-    findings, number = [], 0
-    for found, members in (tables_by_mean(s), tables_by_slope(s)):
-        findings, number = [*findings, *found], number + members
+    findings, number = list[Finding](), 0
+    for groups in (_tables_by_mean(s), _tables_by_slope(s)):
+        number += sum(len(members) for members, _ in groups)
+        for members, (factor, p) in groups:
+            if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
+                row = next(row for row in members[0].parameters if row.physical)
+                fits = [refit(e, e.local(s.values), list(s.flagged.get(e.label, []))) for e in members]
+                estimates = [(e.label, own[row.symbol][0]) for e, own in zip(members, fits, strict=True)]
+                facts = {"name": row.name, "estimates": estimates, "unit": row.unit, "p": p, "factor": factor}
+                findings.append(Finding("trials.tables", "fail", facts, members[0].label))
     return findings or [Finding("trials.tables", "ok", {"number": number})] * bool(number)
 
 
-def tables_by_slope(s: SampledFit) -> tuple[list[Finding], int]:
-    """Findings on tables that each have an offset, such as calibrations of one spring, and the number of tables.
+#: Tables that share their parameters, with the factor by which they disagree and its probability.
+Groups = list[tuple[list[Experiment], tuple[float, float]]]
+
+
+def _tables_by_slope(s: SampledFit) -> Groups:
+    """Tables that each have an offset, such as calibrations of one spring.
 
     The test is that of Alexander and Govern (1994): each table has its own scatter and degrees of freedom.
     """
@@ -317,18 +222,13 @@ def tables_by_slope(s: SampledFit) -> tuple[list[Finding], int]:
         enough = e.scale_known or e.n - len(s.flagged.get(e.label, [])) > len(own) + nuisances
         if e.bench and not e.time_series and own and nuisances and enough:
             alike.setdefault((e.kind, *own), []).append(e)
-    groups, findings = [members for members in alike.values() if len(members) > 1], []
-    for members in groups:
-        row = next(row for row in members[0].parameters if row.physical)
+    groups = []
+    for members in (members for members in alike.values() if len(members) > 1):
+        symbol = next(row.symbol for row in members[0].parameters if row.physical)
         fits = [estimate(e, e.local(s.values), list(s.flagged.get(e.label, []))) for e in members]
-        pairs = [one.scaled(one.scale)[row.symbol] for one in fits]
         freedom = [np.inf if e.scale_known else one.freedom for e, one in zip(members, fits, strict=True)]
-        factor, p = heterogeneity(pairs, freedom)
-        if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
-            estimates = [(e.label, value) for e, (value, _) in zip(members, pairs, strict=True)]
-            facts = {"name": row.name, "estimates": estimates, "unit": row.unit, "p": p, "factor": factor}
-            findings.append(Finding("trials.tables", "fail", facts, members[0].label))
-    return findings, sum(map(len, groups))
+        groups.append((members, heterogeneity([one.scaled(one.scale)[symbol] for one in fits], freedom)))
+    return groups
 
 
 def heterogeneity(pairs: Sequence[tuple[float, float]], freedom: Sequence[float]) -> tuple[float, float]:
@@ -344,34 +244,19 @@ def heterogeneity(pairs: Sequence[tuple[float, float]], freedom: Sequence[float]
     return float(np.sqrt(chi_square / more)), float(stats.chi2.sf(chi_square, more))
 
 
-def tables_by_mean(s: SampledFit) -> tuple[list[Finding], int]:
-    """Findings on tables of trials without offset and with one scatter, and the number of tables.
+def _tables_by_mean(s: SampledFit) -> Groups:
+    """Tables of several trials without offset and with one scatter: an error of the parameters shifts their mean residual.
 
     A permutation test of the scatter between tables. Their common scatter otherwise absorbs what differs between them.
     """
-    alike: dict[tuple[str, ...], list[Experiment]] = {}
+    alike: dict[tuple[str, ...], list[tuple[Experiment, np.ndarray]]] = {}
     for e in s.experiments:
-        if e.bench and not e.time_series and any(row.scatter for row in e.parameters) and _means_count(s, e):
-            alike.setdefault((e.kind, *(row.name for row in e.parameters)), []).append(e)
-    several = [(m, [_unflagged(s, e)[0] for e in m]) for m in alike.values() if len(m) > 1]
-    groups = [(m, residuals) for m, residuals in several if np.std(np.concatenate(residuals)) > SMALLEST_SCATTER]
-    findings = []
-    for members, residuals in groups:
-        factor, p = between(residuals)
-        if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
-            name = next(row for row in members[0].parameters if row.physical)
-            facts = {
-                "name": name.name,
-                "estimates": [
-                    (e.label, refit(e, e.local(s.values), list(s.flagged.get(e.label, [])))[name.symbol][0])
-                    for e in members
-                ],
-                "unit": name.unit,
-                "p": p,
-                "factor": factor,
-            }
-            findings.append(Finding("trials.tables", "fail", facts, members[0].label))
-    return findings, sum(len(members) for members, _ in groups)
+        if e.bench and not e.time_series and any(row.scatter for row in e.parameters):
+            residuals, offsets = _unflagged(s, e)[0], e.misfit(e.local(s.values)).design.shape[1]
+            if offsets == 0 and len(residuals) >= FEWEST_TRIALS:
+                alike.setdefault((e.kind, *(row.name for row in e.parameters)), []).append((e, residuals))
+    several = [tuple(zip(*pairs, strict=True)) for pairs in alike.values() if len(pairs) > 1]
+    return [(list(m), between(r)) for m, r in several if np.std(np.concatenate(r)) > SMALLEST_SCATTER]
 
 
 def check_settings(s: SampledFit) -> list[Finding]:
@@ -487,13 +372,6 @@ def _loads(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
     assert e.loads is not None, "the table has loads"
     load, coefficient = (np.delete(x, list(s.flagged.get(e.label, []))) for x in e.loads)
     return load, coefficient
-
-
-def _means_count(s: SampledFit, e: Experiment) -> bool:
-    """Whether an error of the parameters shifts the mean residual of a table: it has no offset, and several trials."""
-    residuals, _ = _unflagged(s, e)
-    own = e.misfit(e.local(s.values)).design.shape[1]
-    return own == 0 and len(residuals) >= FEWEST_TRIALS
 
 
 def _unflagged(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:

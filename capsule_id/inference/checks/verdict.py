@@ -1,15 +1,18 @@
-"""All checks of a fit, and which of its numbers may be quoted."""
+"""All checks of a fit, the error of its model, and which of its numbers may be quoted."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy import stats
 
+from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.checks import LAGS, LEVEL, correlated_records, refit
+from capsule_id.experiments.checks import LAGS, LEVEL, correlated_records, estimate, refit
+from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.inference.checks.posterior import (
     PRIOR_PULL,
     check_maximum,
@@ -19,11 +22,14 @@ from capsule_id.inference.checks.posterior import (
     default_scatter,
     in_doubt,
 )
-from capsule_id.inference.checks.settings import MOST_FLAGGED, SampledFit, check_trials, outliers
+from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, judged, outliers
+from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.point_stage import SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import is_stated
+from capsule_id.records.tones import length_of_motion
 from capsule_id.views import Finding, Trust
 
 # trust: Which numbers of a fit may be quoted, from its findings.
@@ -61,11 +67,9 @@ def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:
     failed = [concerned(f, sampled.experiments) for f in sampled.findings if f.level == "fail"]
     doubtful = {name for f in sampled.findings if f.level == "warn" for name in f.parameters}
     few = {f.experiment for f in sampled.findings if f.code == "readings.few"}
-    sizes: dict[str, list[bool]] = {}
-    for e in sampled.experiments:
-        for row in e.parameters:
-            sizes.setdefault(row.name, []).append(e.table.label in few)
-    doubtful |= {name for name, are_few in sizes.items() if all(are_few) and not is_stated(name)}
+    enough = {row.name for e in sampled.experiments if e.table.label not in few for row in e.parameters}
+    read = {row.name for e in sampled.experiments for row in e.parameters}
+    doubtful |= {name for name in read - enough if not is_stated(name)}
     words: dict[str, Trust] = {}
     for row, known in zip(sampled.target.parameters, informed, strict=True):
         judged = sampled.posterior is not None and (known or is_stated(row.name)) and row.name not in doubtful
@@ -120,16 +124,12 @@ def check_outliers(s: SampledFit) -> tuple[list[Finding], dict[str, list[int]]]:
 
 def check_stated_errors(s: SampledFit) -> list[Finding]:
     """Check that stated reading errors explain the scatter (chi-square)."""
-    known = [e for e in s.experiments if e.scale_known and e.label not in s.flagged]
-    findings = []
-    for e in known:
+    cases = []
+    for e in (e for e in s.experiments if e.scale_known and e.label not in s.flagged):
         square = float(np.sum(np.asarray(e.residuals(e.local(s.values), np))[: e.n] ** 2))
-        freedom = e.n - 2
-        p = float(stats.chi2.sf(square, freedom)) if freedom > 0 else 1.0
-        if p * len(known) < LEVEL:
-            facts = {"freedom": freedom, "chi_square": square, "p": p}
-            findings.append(Finding("errors.stated", "fail", facts, e.label))
-    return findings or [Finding("errors.stated", "ok")] * bool(known)
+        p = float(stats.chi2.sf(square, e.n - 2)) if e.n > 2 else 1.0
+        cases.append((e.label, p, {"freedom": e.n - 2, "chi_square": square, "p": p}))
+    return judged("errors.stated", cases, LEVEL)
 
 
 # verdict: All checks of a fit: each finding states the experiment, the expected value, the observed value and a remedy.
@@ -147,6 +147,9 @@ def run_checks(sampled: SampledFit) -> SampledFit:
     outliers, flagged = check_outliers(sampled)
     sampled = replace(sampled, flagged=flagged)
     trials = check_trials(sampled)
+    pairs = zip(sampled.target.parameters, informed(sampled.target, sampled.posterior, sampled.fit), strict=True)
+    # No other reading narrows a stated mass or slope. A scatter with a stated reading error may be zero.
+    vague = [row.name for row, known in pairs if row.physical and not is_stated(row.name) and not known]
     findings = [
         *check_starts(sampled.fit, sampled.target, sampled.posterior),
         *check_maximum(sampled),
@@ -157,7 +160,7 @@ def run_checks(sampled: SampledFit) -> SampledFit:
         *trials,
         *check_statistics(sampled, {finding.experiment for finding in trials if finding.level == "fail"}),
         *_declared_findings(sampled, bench=True),
-        *_informed(sampled),
+        Finding("parameters.informed", "warn" if vague else "ok", {"names": ", ".join(vague)}),
         *check_priors(sampled),
         *_boundary(sampled),
         *_declared_findings(sampled, bench=False),
@@ -221,17 +224,6 @@ def informed(target: LogPosterior, posterior: Posterior | None, fit: PointFit) -
     return sd <= INFORMED_RATIO * target.prior_sd
 
 
-def _informed(s: SampledFit) -> list[Finding]:
-    known = informed(s.target, s.posterior, s.fit)
-    # No other reading narrows a stated mass or slope. A scatter with a stated reading error may be zero.
-    names = [
-        row.name
-        for row, ok in zip(s.target.parameters, known, strict=True)
-        if row.physical and not is_stated(row.name) and not ok
-    ]
-    return [Finding("parameters.informed", "warn" if names else "ok", {"names": ", ".join(names)})]
-
-
 def _boundary(s: SampledFit) -> list[Finding]:
     """Find parameters whose posterior lies in the tail of the prior; ``check_priors`` finds scatters by default priors."""
     z = np.abs(s.target.prior_residuals(s.fit.u))
@@ -241,3 +233,231 @@ def _boundary(s: SampledFit) -> list[Finding]:
     keys = [row.prior_key for row in s.target.parameters if row.name in out]
     facts = {"names": ", ".join(names), "keys": ", ".join(filter(None, keys))}
     return [Finding("priors.tails", "warn" if names else "ok", facts, parameters=tuple(names))]
+
+
+# widening: Error of the model, from the scatter of a parameter between parts of the data.
+#
+# Where a check of an experiment fails, its readings and those of its kind that inform the same parameters are
+# divided into parts of consecutive rows. Each part gives an estimate with its own sd. Their weighted chi-square
+# over its degrees of freedom is the squared factor of the sd (Birge 1932), and Student's t gives the interval.
+
+
+#: Fewest parts of the data, and most parts of one table.
+FEWEST_PARTS, MOST_PARTS = 4, 8
+#: Fewest rows of a part, relative to the number of unknowns of its experiment.
+ROWS_PER_UNKNOWN = 2
+#: Largest sd of a part that determines a parameter, relative to its value.
+LARGEST_RELATIVE_SD = 0.5
+#: Smallest factor of an sd that counts.
+SMALLEST_FACTOR = 1.01
+
+
+def widenings(s: SampledFit) -> dict[str, Widening]:
+    """Error of the model of every physical parameter that a failed check of its bench test concerns, by name."""
+    failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
+    kinds = {e.kind for e in s.experiments if e.label in failed or e.table.label in failed}
+    by_load = {f.experiment for f in s.findings if f.code == "trials.loads" and f.level == "fail"}
+    tests = [e for e in s.experiments if e.kind in kinds and e.bench and not has_own_nuisances(e)]
+    found: dict[str, Widening] = {}
+    # Long parts show slow errors, many parts show them more surely. The widest interval counts.
+    for number in (FEWEST_PARTS, MOST_PARTS):
+        estimates: dict[str, list[tuple[float, float]]] = {}
+        for e in tests:
+            for name, pair in estimates_of_parts(e, s.values, number, by_load=e.label in by_load):
+                estimates.setdefault(name, []).append(pair)
+        for name, pairs in estimates.items():
+            one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
+            if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
+                found[name] = one
+    return found
+
+
+def beside_stated(s: SampledFit, found: Mapping[str, Widening]) -> dict[str, Widening]:
+    """Widen only that part of every variance which the readings give, not that of stated masses and slopes.
+
+    The parts share the stated values, so their scatter says nothing of them. The share of the readings is the variance
+    with the stated values held, from the covariance at the maximum.
+    """
+    stated = [i for i, name in enumerate(s.target.names) if is_stated(name)]
+    result = {}
+    for name, one in found.items():
+        i = s.target.names.index(name)
+        variance, with_stated = s.fit.covariance[i, i], s.fit.covariance[np.ix_(stated, [i])]
+        given = float((with_stated.T @ np.linalg.pinv(s.fit.covariance[np.ix_(stated, stated)]) @ with_stated).item())
+        share = float(np.clip(1.0 - given / variance, 0.0, 1.0))
+        factor, stretch = (float(np.sqrt(1.0 - share + share * size**2)) for size in (one.factor, one.stretch))
+        if factor >= SMALLEST_FACTOR:
+            result[name] = Widening(factor, stretch / factor, one.parts)
+    return result
+
+
+def has_own_nuisances(e: Experiment) -> bool:
+    """Whether ``e`` is a run, or a record with an amplitude of its own: its parts have other nuisances than the whole."""
+    return e.event_driven or any(not (row.physical or row.scatter) for row in e.parameters)
+
+
+def widening(pairs: Sequence[tuple[float, float]]) -> Widening:
+    """Factor and quantile from estimates and standard errors of parts."""
+    value, sd = np.array(pairs).T
+    weight = sd**-2.0
+    chi_square = float(np.sum(weight * (value - np.average(value, weights=weight)) ** 2))
+    freedom = len(pairs) - 1
+    quantile = float(stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975))
+    return Widening(max(1.0, float(np.sqrt(chi_square / freedom))), quantile, len(pairs))
+
+
+def estimates_of_parts(
+    e: Experiment, values: Mapping[str, float], number: int, by_load: bool = False
+) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Name, estimate and standard error of every physical parameter from every part of ``e`` that can be fitted.
+
+    The parts share one noise level, from all of their misfits: those of a few rows are too uncertain to weight them.
+
+    Parameters
+    ----------
+    number : of parts, fewer where they would have too few rows
+    by_load : whether a part holds the rows of one load, of similar loads where there are many, not consecutive rows
+    """
+    parts = []
+    for rows in rows_of_parts(e, values, number, by_load):
+        try:
+            columns = {name: replace(own, values=own.values[rows]) for name, own in e.table.columns.items()}
+            table = replace(e.table, columns=columns, rows=e.table.rows[rows])
+            (part,) = type(e).make(table, e.rig, getattr(e, "friction", EQUATION_1))
+            with np.errstate(all="ignore"):
+                parts.append((part, estimate(part, part.local(values), [])))
+        except (InputError, ValueError, np.linalg.LinAlgError, IndexError, ArithmeticError):
+            continue  # a part without motion or with one level of x determines nothing
+    if not parts:
+        return
+    freedom = [one.freedom for _, one in parts]
+    scale = float(np.average([one.scale for _, one in parts], weights=freedom))
+    for part, one in parts:
+        found = one.scaled(scale)
+        for row in part.parameters:
+            value, sd = found.get(row.symbol, (np.nan, np.nan))
+            if 0.0 < sd < LARGEST_RELATIVE_SD * abs(value):
+                yield row.name, (value, sd)
+
+
+def rows_of_parts(e: Experiment, values: Mapping[str, float], number: int, by_load: bool) -> list[np.ndarray]:
+    """Rows of the parts of ``e``; parameters as in ``estimates_of_parts``; [] for a table that is too short."""
+    unknowns = sum(not row.scatter for row in e.parameters) + e.misfit(e.local(values)).design.shape[1]
+    rows = np.arange(len(e.table.rows))
+    if e.time_series and e.n == len(rows):
+        # Most of the energy of a record lies before it is all noise.
+        rows = rows[: length_of_motion(e.observed)]
+    number = min(number, len(rows) // max(ROWS_PER_UNKNOWN * unknowns, 3))
+    if number < 2:
+        return []
+    if e.loads is None or not by_load:
+        return np.array_split(rows, number)
+    levels, index = np.unique(e.loads[0], return_inverse=True)
+    if FEWEST_PARTS <= len(levels) <= MOST_PARTS:
+        return [np.flatnonzero(index == level) for level in range(len(levels))]
+    return np.array_split(np.argsort(e.loads[0], kind="stable"), number)
+
+
+# record widening: Error of the model in runs and decays, from the scores of parts of their records.
+#
+# residuals and Jacobian at the fit -> derivative with respect to one parameter, the others refitted
+#     -> step of that parameter from every part -> chi-square between the parts (``widening``)
+#
+# A run, or a decay with an amplitude, a drift or noise of its own, determines some parameters only as a whole, so its
+# parts are not fitted. Each part gives a Gauss-Newton step of one parameter and its sd. A record is divided into
+# successive whole periods, that of a run also by phase of the excitation. A misfit that repeats with every period shows
+# between phases only. The widest interval counts.
+
+
+#: Parts of an excitation period. They are long beside most waves of a misfit, so that their steps are independent.
+PHASES = 6
+#: Number of the priors, which every part meets. Without them the step of a parameter that the data leave open has no end.
+PRIORS = -2
+#: Numbers of the parts of the n samples of a record; None where it cannot be divided in this way.
+Division = Callable[[Experiment], Int[np.ndarray, " n"] | None]
+
+
+def record_widenings(s: SampledFit) -> dict[str, Widening]:
+    """Error of the model of every physical parameter of a run or a decay with a failed check, by name."""
+    failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
+    records = [e for e in s.experiments if {e.label, e.table.label} & failed and has_own_nuisances(e)]
+    if not any(e.cycles is not None for e in records):
+        return {}
+    # Stated values are no estimates from the parts: ``beside_stated`` adds their share of the sd.
+    located = np.array([i for i in s.target.located if not is_stated(s.target.names[i])])
+    jacobian, residuals = residual_jacobian(s.target, s.fit.u)[:, located], s.target.plain_residuals(s.fit.u)
+    informed = {row.name for e in records for row in e.parameters if row.physical}
+    found = {}
+    for division in (by_time, by_phase):
+        part = parts_of_residuals(s, records, division)
+        for k, i in enumerate(located.tolist()):
+            name, largest_sd = s.target.names[i], LARGEST_RELATIVE_SD
+            if name not in informed:
+                continue
+            largest_sd *= 1.0 if s.target.positive[i] else abs(s.fit.u[i])
+            pairs = [pair for pair in steps_of_parts(jacobian, residuals, k, part) if pair[1] < largest_sd]
+            one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
+            if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
+                found[name] = one
+    return found
+
+
+def by_time(record: Experiment) -> Int[np.ndarray, " n"] | None:
+    """Successive parts of whole periods, about equally long; -1: the end of a decay, which is all noise."""
+    if record.cycles is None:
+        return None
+    cycle = (record.cycles - record.cycles[0]).astype(int)
+    end = len(cycle) if record.event_driven else length_of_motion(record.observed)
+    number = int(cycle[end - 1]) + 1
+    return np.where(np.arange(len(cycle)) < end, cycle * min(number, MOST_PARTS) // number, -1)
+
+
+def by_phase(record: Experiment) -> Int[np.ndarray, " n"] | None:
+    """The same parts of every excitation period; None of a decay, whose period is not exactly known."""
+    if record.cycles is None or not record.event_driven:
+        return None
+    return (record.cycles % 1.0 * PHASES).astype(int) % PHASES
+
+
+def parts_of_residuals(s: SampledFit, records: Sequence[Experiment], division: Division) -> Int[np.ndarray, " m"]:
+    """Part of each of ``LogPosterior.plain_residuals``; -1, one more part, for other experiments; ``PRIORS`` for priors."""
+    parts, used = [], 0
+    for e in s.experiments:
+        own = np.full(len(e.residuals(e.local(s.values), np)), -1)
+        numbers = next((division(one) for one in records if one is e), None)
+        if numbers is not None:
+            channels = e.n // len(numbers)
+            own[: channels * len(numbers)] = np.tile(np.where(numbers < 0, -1, used + numbers), channels)
+            used += int(np.max(numbers)) + 1
+        parts.append(own)
+    return np.concatenate([*parts, np.full(s.target.dimension, PRIORS)])
+
+
+def steps_of_parts(
+    jacobian: Float[np.ndarray, "m d"], residuals: Float[np.ndarray, " m"], k: int, part: Int[np.ndarray, " m"]
+) -> list[tuple[float, float]]:
+    """Gauss-Newton step of parameter k and its sd from every part that informs it.
+
+    A part meets the other parameters as the rest of the data gives them: the fit to all of the data has adapted them
+    to the misfit of the part itself. A part without which the fit has no solution, or one less certain than the part, gives
+    no step: the first period of a strong decay holds most of what the record tells.
+    """
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
+    jacobian = jacobian / scale
+    others = np.linalg.qr(np.delete(jacobian, k, axis=1))[0]
+    own = jacobian[:, k] - others @ (others.T @ jacobian[:, k])
+    pairs = []
+    for number in np.unique(part[part != PRIORS]):
+        rows, rest = part == number, part != number
+        information = float(np.sum(own[rows] ** 2))
+        if information == 0.0 or np.linalg.matrix_rank(jacobian[rest]) < jacobian.shape[1]:
+            continue
+        effect = -own[rows] @ jacobian[rows] / information
+        effect[k] += 1.0
+        if effect @ np.linalg.solve(jacobian[rest].T @ jacobian[rest], effect) > 1.0 / information:
+            continue
+        step = np.linalg.lstsq(jacobian[rest], -residuals[rest], rcond=None)[0]
+        beyond = residuals[rows] + jacobian[rows] @ step
+        value = step[k] - float(own[rows] @ beyond) / information
+        pairs.append((value / scale[k], information**-0.5 / scale[k]))
+    return pairs

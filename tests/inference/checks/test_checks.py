@@ -14,9 +14,10 @@ from capsule_id.experiments.free_vibration.models import decay as rubbed_decay
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.line import Line, curvature_test
 from capsule_id.experiments.static_friction import tilts as tilted
-from capsule_id.inference.checks.settings import SampledFit, _basis, outliers
+from capsule_id.inference.checks.settings import _basis, outliers
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.synthetic import Truth, synthesize

@@ -12,10 +12,9 @@ import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.checks.posterior import check_maximum, check_starts, modes
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.pipeline import higher_maximum, sample_posterior, stage_seeds
 from capsule_id.inference.point_fit import point_fit
-from capsule_id.inference.point_stage import fit_points
+from capsule_id.inference.point_stage import SampledFit, fit_points
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.target import LogPosterior
 from capsule_id.report.messages import FIT_MESSAGES, finding_text

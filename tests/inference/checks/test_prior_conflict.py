@@ -13,8 +13,8 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.inference.checks.posterior import conflicts
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.rig.model import Rig

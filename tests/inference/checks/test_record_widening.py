@@ -11,8 +11,7 @@ import pytest
 from capsule_id.experiments.forced_run.drives import BaseRun
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.models import decay
-from capsule_id.inference.checks.settings import SampledFit
-from capsule_id.inference.checks.widening import (
+from capsule_id.inference.checks.verdict import (
     FEWEST_PARTS,
     PRIORS,
     by_phase,
@@ -23,6 +22,7 @@ from capsule_id.inference.checks.widening import (
     widening,
 )
 from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.views import Finding

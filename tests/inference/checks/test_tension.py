@@ -9,7 +9,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.dynamic_friction import DISTANCE_SD, SPEED_SD, pushes
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.static_friction import tilts
-from capsule_id.inference.checks.settings import tension
+from capsule_id.inference.point_stage import tension
 from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.synthetic import Truth
 

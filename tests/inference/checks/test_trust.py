@@ -9,9 +9,9 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.verdict import trust_words
 from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.target import LogPosterior
 from capsule_id.synthetic import synthesize

@@ -10,8 +10,8 @@ from scipy import stats
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.inference.checks.settings import Widening
-from capsule_id.inference.checks.widening import beside_stated, widening
+from capsule_id.inference.checks.verdict import beside_stated, widening
+from capsule_id.inference.point_stage import Widening
 from tests.experiments.bench import K1, M1, released
 from tests.inference.checks.test_order import drifting
 from tests.measured.folders import Entry, make_rig, quantity

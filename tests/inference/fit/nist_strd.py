@@ -6,15 +6,15 @@ standard deviations and residual sum of squares (11 digits, computed by NIST in 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.inference.curvature import Covariance, covariance
-from capsule_id.inference.least_squares import LeastSquaresFit
+from capsule_id.inference.curvature import covariance
+from capsule_id.inference.least_squares import SOLVER, LeastSquaresFit, Solver, least_squares
 
 Model = Callable[[jax.Array, np.ndarray], jax.Array]
 
@@ -214,6 +214,17 @@ PROBLEMS: tuple[StrdProblem, ...] = (
 )
 
 
+def solve(residual: Callable[[jax.Array], jax.Array], starts: np.ndarray, solver: Solver = SOLVER) -> LeastSquaresFit:
+    """Least squares of a JAX function, its Jacobian in forward mode."""
+    both = jax.jit(lambda x: (residual(x), jax.jacfwd(residual)(x)))
+
+    def linearise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        residuals, jacobian = both(jnp.asarray(x))
+        return np.asarray(residuals), np.asarray(jacobian)
+
+    return least_squares(linearise, starts, solver)
+
+
 def best_of(fit: LeastSquaresFit) -> int:
     """Index of the start with the smallest cost among those that converged."""
     return int(np.argmin(np.where(fit.stalled, np.inf, fit.cost)))
@@ -226,8 +237,12 @@ def residual_sd_of(fit: LeastSquaresFit, start: int | None = None) -> float:
     return float(np.sqrt(2.0 * fit.cost[index] / (n - d)))
 
 
-def covariance_of(fit: LeastSquaresFit, residual_sd: float | None = None, start: int | None = None) -> Covariance:
-    """Covariance at the end of ``start``, by default the best one, with the sd of its own residuals by default."""
+def covariance_of(fit: LeastSquaresFit, residual_sd: float | None = None, start: int | None = None) -> np.ndarray:
+    """Covariance (d, d) at the end of ``start``, by default the best one, with the sd of its own residuals by default."""
     index = best_of(fit) if start is None else start
-    found = covariance(fit.jacobian[index])
-    return replace(found, matrix=(residual_sd or residual_sd_of(fit, index)) ** 2 * found.matrix)
+    return (residual_sd or residual_sd_of(fit, index)) ** 2 * covariance(fit.jacobian[index])
+
+
+def errors_of(fit: LeastSquaresFit, residual_sd: float | None = None, start: int | None = None) -> np.ndarray:
+    """Standard errors (d,); parameters as in ``covariance_of``."""
+    return np.sqrt(np.diag(covariance_of(fit, residual_sd, start)))

@@ -4,7 +4,7 @@ import signal
 import threading
 import time
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal, cast
@@ -22,7 +22,6 @@ from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.inference import joint_fit as joint_starts
 from capsule_id.inference import joint_fit as module
 from capsule_id.inference.checks.posterior import check_starts
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.joint_fit import (
     LEAST_INCREASE,
     STARTS,
@@ -36,17 +35,19 @@ from capsule_id.inference.joint_fit import (
     scatter_modes,
     weigh,
 )
-from capsule_id.inference.least_squares import Solver, least_squares, linearised
+from capsule_id.inference.least_squares import Solver, linearised
 from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.sampling import laplace_proposal
 from capsule_id.inference.tables import check_engine, smoothing_shift
-from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import ModelChoices, Quantity
 from tests.experiments import bench
 from tests.forced_runs import TRUTH, recorded, table
+from tests.inference.fit.nist_strd import solve
 from tests.inference.three_settings import three_settings
 
 #: What a bench would tell: every shared parameter within 2 %.
@@ -135,7 +136,7 @@ def test_a_minimum_on_a_kink_is_one_unless_much_is_left_to_gain(pull: float, con
     noise = np.random.default_rng(0).standard_normal(2500)
     noise += (pull - np.sum(noise) / 50.0) / 50.0
     residual = Partial(lambda noise, v: noise + jnp.abs(v[0]) / 50.0, jnp.asarray(noise))
-    fit = least_squares(residual, np.array([[3.0]]), Solver(heavy=True))
+    fit = solve(residual, np.array([[3.0]]), Solver(heavy=True))
     assert fit.x[0, 0] == pytest.approx(0.0, abs=1e-3)
     assert fit.stalled[0]
     assert _is_converged(fit) is converged
@@ -203,14 +204,14 @@ def test_scipy_finds_the_same_minimum() -> None:
     """
     target, fit = fitted()
     located = target.located
-    residual = HeldResiduals(target, jnp.asarray(fit.u))
+    at = partial(linearised, target, fit.u)
     sd = np.sqrt(np.diag(fit.covariance))[located]
-    ours = 0.5 * float(np.sum(linearised(residual, fit.u[located])[0] ** 2))
+    ours = 0.5 * float(np.sum(at(fit.u[located])[0] ** 2))
     distances = []
     for seed in (0, 1):
         start = fit.u[located] + 0.5 * sd * np.random.default_rng(seed).standard_normal(len(located))
         found = optimize.least_squares(
-            lambda v: linearised(residual, v)[0], start, lambda v: linearised(residual, v)[1], x_scale="jac",
+            lambda v: at(v)[0], start, lambda v: at(v)[1], x_scale="jac",
             ftol=1e-15, xtol=1e-12, gtol=1e-15,
         )  # fmt: skip
         assert found.cost == pytest.approx(ours, abs=0.1)

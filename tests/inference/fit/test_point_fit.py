@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import optimize
@@ -10,6 +9,7 @@ from scipy import optimize
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.inference.checks.posterior import check_starts
+from capsule_id.inference.marginal import density_of
 from capsule_id.inference.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
@@ -40,7 +40,7 @@ def test_it_is_a_maximum(twin: LogPosterior, fit: PointFit) -> None:
     root = np.linalg.cholesky(fit.covariance)
 
     def objective(v: np.ndarray) -> float:
-        return -float(twin.batch(jnp.asarray(fit.u + root @ v)[None])[0])
+        return -float(density_of(twin)((fit.u + root @ v)[None])[0])
 
     step = 1e-3
     gradient = optimize.approx_fprime(np.zeros(twin.dimension), objective, step)

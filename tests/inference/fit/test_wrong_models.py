@@ -7,9 +7,8 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.twin import NOISE_SD
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference import point_stage
-from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.verdict import check_whiteness
-from capsule_id.inference.point_stage import fit_points
+from capsule_id.inference.point_stage import SampledFit, fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.report.messages import FIT_MESSAGES, finding_text

@@ -15,8 +15,8 @@ from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference import moves
 from capsule_id.inference import sampling as emulation
 from capsule_id.inference import sampling as ensembles
-from capsule_id.inference.ensemble import Ensemble, initial_state
 from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.moves import Ensemble, initial_state
 from capsule_id.inference.proposal import block_proposal
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import DELAYED, Emulation, ExactMotions, Places, sample

@@ -6,17 +6,20 @@ import pytest
 from scipy import stats
 
 from capsule_id.inference import proposal as coordinates
-from capsule_id.inference import refinement
-from capsule_id.inference.ensemble import Ensemble, initial_state
-from capsule_id.inference.moves import effective_sample_size, ensemble_time
+from capsule_id.inference import proposal as refinement
+from capsule_id.inference.moves import Ensemble, effective_sample_size, ensemble_time, initial_state
 from capsule_id.inference.proposal import (
     BlockProposal,
     Coordinates,
     Mixture,
+    Transported,
+    _Rounds,
     block_proposal,
     coordinates_of,
+    effective_size,
+    refined,
+    tempered,
 )
-from capsule_id.inference.refinement import Transported, _Rounds, effective_size, refined, tempered
 from capsule_id.inference.sampling import pilot, sample
 from tests.inference.stub import Gaussian
 

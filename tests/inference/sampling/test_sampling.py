@@ -10,7 +10,7 @@ from scipy.special import ndtri
 from capsule_id.inference import sampling as ensembles
 from capsule_id.inference.marginal import uniform_at
 from capsule_id.inference.moves import effective_sample_size, ensemble_time
-from capsule_id.inference.refinement import affordable_rounds
+from capsule_id.inference.proposal import affordable_rounds
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling import DEFAULT_ESS, ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
 from tests.inference.stub import Gaussian

@@ -21,11 +21,12 @@ from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.static_friction import TILT_SD
-from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.inference.marginal import density_of
+from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import TABLE, Parameter, Prior, parameter
 from capsule_id.synthetic import Truth, synthesize
 from tests.capsule_cases import jit_quickly
-from tests.inference.stub import Nothing, rig_without_tables
+from tests.inference.stub import Nothing, log_likelihood, log_prior, rig_without_tables
 
 PRIORS = {
     "lognormal": (Prior("lognormal", 0.3, 10.0), stats.lognorm(s=np.log(10.0) / stats.norm.ppf(0.975), scale=0.3)),
@@ -51,7 +52,7 @@ def test_log_prior_against_scipy(prior: Prior, reference: Any) -> None:
         slopes = [(target.theta(u + h) - target.theta(u - h)) / (2.0 * h) for h in (step, 2.0 * step)]
         slope = (4.0 * slopes[0] - slopes[1]) / 3.0
         expected = reference.logpdf(theta) + np.log(slope[0])
-        assert float(target.log_prior(jnp.asarray(u))) == pytest.approx(expected, rel=1e-10, abs=1e-10)
+        assert log_prior(target, u) == pytest.approx(expected, rel=1e-10, abs=1e-10)
 
 
 @CASES
@@ -61,7 +62,7 @@ def test_prior_integrates_to_one(prior: Prior, reference: Any) -> None:
     if prior.kind in ("halfnormal", "positive_normal"):  # a density of theta at 0: in u its tail falls like exp(u)
         ends[0] = min(ends[0], ends[1] - 35.0)
     mass = sum(
-        integrate.quad(lambda u: float(np.exp(target.log_prior(jnp.array([u])))), a, b, limit=400, epsabs=1e-11)[0]
+        integrate.quad(lambda u: float(np.exp(log_prior(target, np.array([u])))), a, b, limit=400, epsabs=1e-11)[0]
         for a, b in np.stack([np.linspace(ends[0], ends[2], 9)[:-1], np.linspace(ends[0], ends[2], 9)[1:]], axis=1)
     )
     assert mass == pytest.approx(1.0, abs=1e-8)
@@ -105,14 +106,12 @@ def test_joint_prior_is_the_sum() -> None:
     priors = [prior for prior, _ in PRIORS.values()]
     joint, singles = target_of(*priors), [target_of(prior) for prior in priors]
     u = joint.unconstrain(np.array([0.4, 0.03, 0.1101, 0.2, 0.3]))
-    expected = sum(float(t.log_prior(jnp.asarray(u[i : i + 1]))) for i, t in enumerate(singles))
-    assert float(joint.log_prior(jnp.asarray(u))) == pytest.approx(expected, rel=1e-13)
+    expected = sum(log_prior(t, u[i : i + 1]) for i, t in enumerate(singles))
+    assert log_prior(joint, u) == pytest.approx(expected, rel=1e-13)
     residuals = joint.prior_residuals(u)
     moved = u + np.array([0.1, 0.0, 0.0, 0.0, 0.2])
     gain = 0.5 * np.sum(residuals**2) - 0.5 * np.sum(joint.prior_residuals(moved) ** 2)
-    assert float(joint.log_prior(jnp.asarray(moved)) - joint.log_prior(jnp.asarray(u))) == pytest.approx(
-        gain, rel=1e-10
-    )
+    assert log_prior(joint, moved) - log_prior(joint, u) == pytest.approx(gain, rel=1e-10)
 
 
 def test_default_priors_are_as_documented() -> None:
@@ -162,8 +161,7 @@ def test_log_posterior_is_the_sum_of_its_experiments(
     values = target.mapping(target.theta(u))
     assert len(experiments) == 9
     expected = sum(float(e.log_likelihood(e.local(values), np)) for e in experiments)
-    batched = np.asarray(target.batch(jnp.asarray(u[None])))[0]
-    assert float(batched - target.log_prior(jnp.asarray(u))) == pytest.approx(expected, rel=1e-11)
+    assert log_likelihood(target, u) == pytest.approx(expected, rel=1e-11)
 
 
 def test_residuals_by_both_routes(twin: tuple[LogPosterior, tuple[Experiment, ...]]) -> None:
@@ -176,11 +174,10 @@ def test_residuals_by_both_routes(twin: tuple[LogPosterior, tuple[Experiment, ..
 
 def assert_same_jacobian(target: LogPosterior, u: np.ndarray) -> None:
     """One tangent per symbol gives the derivatives that forward mode gives with one per parameter of the rig."""
-    located = target.located
-    held = HeldResiduals(target, jnp.asarray(u))
-    expected = np.asarray(jit_quickly(jax.jacfwd(lambda v: held(v)))(u[located]))
-    residuals, jacobian = jit_quickly(lambda v: held.linearised(v))(u[located])
-    np.testing.assert_allclose(residuals, held(u[located]), rtol=1e-11, atol=1e-11)
+    at, plain = jnp.asarray(u), jit_quickly(lambda u: target.residuals(u))
+    expected = np.asarray(jit_quickly(jax.jacfwd(lambda u: target.residuals(u)))(at))[:, target.located]
+    residuals, jacobian = jit_quickly(lambda u: target.linearised(u))(at)
+    np.testing.assert_allclose(residuals, plain(at), rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(jacobian, expected, rtol=1e-11, atol=1e-11 * np.max(np.abs(expected)))
     assert np.all(np.any(expected != 0.0, axis=0))
 
@@ -215,7 +212,7 @@ def test_overdamped_decays_have_no_density(twin: tuple[LogPosterior, tuple[Exper
     target, _ = twin
     u = at_truth(target)
     u[target.names.index("c")] = np.log(30.0)  # critical damping is 2 sqrt(k1 m1) = 25 N s/m
-    assert float(target.batch(jnp.asarray(u[None]))[0]) == -np.inf
+    assert float(density_of(target)(u[None])[0]) == -np.inf
 
 
 @pytest.mark.full
@@ -229,7 +226,7 @@ def test_rigs_of_one_structure_do_not_share_numbers(tmp_path: Path) -> None:
         u = at_truth(target)
         local = target.mapping(target.theta(u))
         expected = sum(float(e.log_likelihood(e.local(local), np)) for e in target.experiments)
-        found = float(target.batch(jnp.asarray(u[None]))[0] - target.log_prior(jnp.asarray(u)))
+        found = log_likelihood(target, u)
         assert found == pytest.approx(expected, rel=1e-11)
         values.append(found)
     assert values[0] != pytest.approx(values[1], rel=1e-3)
