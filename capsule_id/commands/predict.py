@@ -3,21 +3,23 @@
 import argparse
 from pathlib import Path
 
+from capsule_id.commands import PATH
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import say
 from capsule_id.errors import InputError, check_seed, refusing
 from capsule_id.output import replace_file
 from capsule_id.views import counted
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add RESULT, SETTINGS and the options."""
-    parser.add_argument("result", metavar="RESULT", type=Path, help="result directory of fit-params")
-    parser.add_argument("settings", metavar="SETTINGS", type=Path, help="table of a progression without distance")
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="table of the predictions, a new file")
-    parser.add_argument("--figure", metavar="PNG", type=Path, help="mean velocities against period too, a new file")
-    parser.add_argument("--seed", type=int, default=0, help="random seed of the draws (default 0)")
-    add_cache_argument(parser)
+OPTIONS = {
+    "": (
+        ("result", "RESULT", "result directory of fit-params", PATH),
+        ("settings", "SETTINGS", "table of a progression without distance", PATH),
+        ("--out", "FILE", "table of the predictions, a new file", {**PATH, "required": True}),
+        ("--figure", "PNG", "mean velocities against period too, a new file", PATH),
+        ("--seed", None, "random seed of the draws (default 0)", {"type": int, "default": 0}),
+        add_cache_argument,
+    )
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_and_drive, capsule_values, number
+from capsule_id.commands import PATH
+from capsule_id.commands.capsule_options import capsule_and_drive, capsule_options, capsule_values, number
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import complain, say
 from capsule_id.errors import InputError, refusing
@@ -23,23 +24,25 @@ PICTURE_SAMPLES = 20_000
 STATE = {"X1": "m", "Y1": "m/s", "X2": "m", "Y2": "m/s"}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options. ``run`` parses all numbers, so that errors name rule and remedy."""
-    add_capsule_arguments(parser)
-    group = parser.add_argument_group("run")
-    group.add_argument("--periods", metavar="N", help="length in excitation periods (default 20)")
-    group.add_argument("--duration", metavar="X", help="length in s, instead of --periods")
-    group.add_argument("--samples", metavar="N", default="2000", help="number of samples (default 2000)")
-    group.add_argument("--initial", nargs=4, metavar=tuple(STATE), help="state at the start, m and m/s (default: rest)")
-    group = parser.add_argument_group("model")
-    group.add_argument("--model", choices=["exact", "smooth"], default="exact", help="event-driven or smoothed")
-    group.add_argument("--semantics", choices=["stick-slip", "eq2"], default="stick-slip", help="eq2: smooth only")
-    for name, unit in WIDTHS.items():
-        group.add_argument(f"--{name}", metavar="X", help=f"of the smoothed model, {unit} (default: certified)")
-    group = parser.add_argument_group("output")
-    group.add_argument("--out", metavar="FILE", type=Path, required=True, help="table: FILE.csv or FILE.nc (NetCDF)")
-    group.add_argument("--figure", metavar="FILE", type=Path, help="figure: FILE.png")
-    add_cache_argument(group)
+OPTIONS = {
+    **capsule_options(),
+    "run": (
+        ("--periods", "N", "length in excitation periods (default 20)"),
+        ("--duration", "X", "length in s, instead of --periods"),
+        ("--samples", "N", "number of samples (default 2000)", {"default": "2000"}),
+        ("--initial", tuple(STATE), "state at the start, m and m/s (default: rest)", {"nargs": 4}),
+    ),
+    "model": (
+        ("--model", None, "event-driven or smoothed", {"choices": ["exact", "smooth"], "default": "exact"}),
+        ("--semantics", None, "eq2: smooth only", {"choices": ["stick-slip", "eq2"], "default": "stick-slip"}),
+        *((f"--{name}", "X", f"of the smoothed model, {unit} (default: certified)") for name, unit in WIDTHS.items()),
+    ),
+    "output": (
+        ("--out", "FILE", "table: FILE.csv or FILE.nc (NetCDF)", {**PATH, "required": True}),
+        ("--figure", "FILE", "figure: FILE.png", PATH),
+        add_cache_argument,
+    ),
+}
 
 
 def run(args: argparse.Namespace) -> int:
