@@ -238,10 +238,9 @@ class Fit(Result):
         return _drawn(figures.force_on_rod, _named(records, name, attrgetter("name")), ax)
 
     def plot_corner(self, ax: Axes | None = None) -> Figure:
-        """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair: the figure."""
+        """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair, in the place of ``ax``: the figure."""
         columns = sampled_parameters(self)
-        _, width, height = figures.corner_size(len(columns.names))
-        return figure_of(_drawn(figures.corner, columns, ax, width, height))
+        return _drawn_in_panels(figures.corner, columns, ax, *figures.corner_size(columns))
 
     def plot_traces(self, ax: Axes | None = None) -> Figure:
         """A few walkers of each ensemble against the step, several panels in the place of ``ax``: the figure."""

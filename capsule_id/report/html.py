@@ -112,8 +112,8 @@ def drawings(result: Result) -> Iterator[Drawing]:
     if result.posterior is not None:
         columns = sampled_parameters(result)
         caption = "Posterior of the physical parameters: histograms, and contours of every pair."
-        figures.corner(columns, ax := figures.corner_axes(len(columns.names)))
-        yield "corner", "sample", "Corner plot", caption, figure_of(ax), _corner_alt(columns), ""
+        figures.corner(columns, figure := new_figure(*figures.corner_size(columns)))
+        yield "corner", "sample", "Corner plot", caption, figure, _corner_alt(columns), ""
         ensembles = counted(len(result.posterior.draws), "ensemble")
         caption = f"A few walkers of each ensemble, one colour per ensemble ({ensembles})."
         alt = f"Traces of every physical parameter, {ensembles}; the largest split R-hat is {max(result.posterior.rhat):.4f}."
