@@ -52,15 +52,23 @@ def replace_file(path: Path, content: bytes | str, needed: int = 0) -> None:
     OutputError
         As ``write_file``.
     """
-    path = Path(os.path.realpath(path))  # a link stays
-    new = path.with_name(path.name + NEW)
+    replace_files({path: content}, needed)
+
+
+def replace_files(contents: Mapping[Path, bytes | str], needed: int = 0) -> None:
+    """As ``replace_file``; no file is renamed before all are written."""
+    files = [Path(os.path.realpath(path)) for path in contents]  # a link stays
+    new = [path.with_name(path.name + NEW) for path in files]
     try:
-        write_file(new, content, needed)
-        with writing(path):
-            new.replace(path)
+        for path, content in zip(new, contents.values(), strict=True):
+            write_file(path, content, needed)
+        for path, file in zip(new, files, strict=True):
+            with writing(file):
+                path.replace(file)
     except OutputError:
-        with suppress(OSError):
-            new.unlink()
+        for path in new:
+            with suppress(OSError):
+                path.unlink()
         raise
 
 

@@ -5,7 +5,7 @@ import logging
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import Progress, complain, saved, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
-from capsule_id.output import NEW, PARTIAL, check_parents, write_file
+from capsule_id.output import NEW, PARTIAL, check_parents, replace_files
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
@@ -75,32 +75,6 @@ def prepare_store(out: Path, resume: bool) -> Path:
         with refusing("FILE.nc.partial must be writable", "choose another --out", store):
             shutil.rmtree(store)
     return store
-
-
-def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
-    """Write both files under temporary names in the same folder, then rename them.
-
-    Raises
-    ------
-    InputError
-        If they cannot be written.
-    """
-    from capsule_id.report.figures.style import png
-    from capsule_id.report.netcdf import netcdf_bytes
-
-    files = out, out.with_suffix(".png")
-    new = [path.with_name(f".{path.name}{NEW}") for path in files]
-    try:
-        with refusing("the output must be writable", "choose another --out", out):
-            out.parent.mkdir(parents=True, exist_ok=True)
-            for path, content in zip(new, (netcdf_bytes(data), png(figure)), strict=True):
-                write_file(path, content)
-            for path, file in zip(new, files, strict=True):
-                path.replace(file)
-    finally:
-        for path in new:
-            with suppress(OSError):
-                path.unlink()
 
 
 # cluster: A Dask cluster for the blocks of a map or for rigs: threads or processes of this machine, or a running
@@ -243,7 +217,8 @@ def run(args: argparse.Namespace) -> int:
     store = prepare_store(out, args.resume)
     prepare_jax(not args.no_cache)
     from capsule_id.physics.forces import warn_of_far_gap
-    from capsule_id.report.figures.style import own_style
+    from capsule_id.report.figures.style import own_style, png
+    from capsule_id.report.netcdf import netcdf_bytes
 
     with Progress(not args.quiet, unit="point") as progress, client_of(args.scheduler) as client:
         data = _dataset(args, axes, values, {"store": store, "client": client, "progress": progress})
@@ -252,7 +227,10 @@ def run(args: argparse.Namespace) -> int:
         data.attrs["rig"] = rig.name if rig is not None else ""
         measured = _measured_points(args, rig, axes, values) if rig is not None else ()
         with own_style():
-            publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+            figure = png(draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+        with refusing("the output must be writable", "choose another --out", out):
+            out.parent.mkdir(parents=True, exist_ok=True)
+            replace_files({out: netcdf_bytes(data), out.with_suffix(".png"): figure})
     saved.clear()
     shutil.rmtree(store, ignore_errors=True)
     say(_summary_text(data, axes, out))
