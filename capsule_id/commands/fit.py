@@ -71,7 +71,10 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If the input is bad; then nothing is written.
     """
-    _check_numbers(args)
+    check_seed(args.seed)
+    for option, value in (("--max-steps", args.max_steps), ("--ess", args.ess)):
+        if value < 1:
+            raise InputError(f"{option} must be positive", str(value), "give 1 or more")
     kinds = default_registry()
     rigs = [read_rig(folder, kinds) for folder in args.data]
     if args.compare is not None:
@@ -91,14 +94,6 @@ def run(args: argparse.Namespace) -> int:
     directory = args.out or root / rigs[0].name
     with Progress(not args.quiet) as progress:
         return fit_one(rigs[0], options, directory, kinds, progress, resume=args.resume, as_json=args.json)
-
-
-def _check_numbers(args: argparse.Namespace) -> None:
-    """Refuse numbers that no fit has."""
-    check_seed(args.seed)
-    for option, value in (("--max-steps", args.max_steps), ("--ess", args.ess)):
-        if value < 1:
-            raise InputError(f"{option} must be positive", str(value), "give 1 or more")
 
 
 def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> int:

@@ -2,7 +2,6 @@
 
 import argparse
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
     if args.figure is not None:
         _check_suffix(args.figure, (".png",))
     values = capsule_values(args)
-    period = _period(values)
+    # A force that does not repeat has no period.
+    period = values.get("period", 2.0 * math.pi / values["Omega"] if values.get("Omega", 0.0) > 0.0 else None)
     end, samples = _length(args, period)
     X1, Y1, X2, Y2 = (number(name, text) for name, text in zip(STATE, args.initial or ["0"] * 4, strict=True))
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
@@ -75,7 +75,8 @@ def run(args: argparse.Namespace) -> int:
 
     p, e = capsule_and_drive(values, args.drive)
     grid = np.linspace(0.0, end, samples)
-    section = _section(period, end)
+    # Times at which the drive has its initial phase.
+    section = np.zeros(0) if period is None else period * np.arange(np.floor(end / period) + 1.0)
     # Impacts are short: the figure needs more samples than the table.
     drawn = np.linspace(0.0, end, PICTURE_SAMPLES) if args.figure is not None else section
     times = np.union1d(np.union1d(grid, section), drawn)
@@ -99,13 +100,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _period(values: Mapping[str, float]) -> float | None:
-    """Period of the drive, s; None for a force that does not repeat."""
-    if "period" in values:
-        return values["period"]
-    return 2.0 * math.pi / values["Omega"] if values["Omega"] > 0.0 else None
-
-
 def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]:
     """End of the run in s and number of samples."""
     if args.periods is not None and args.duration is not None:
@@ -123,15 +117,6 @@ def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]
     if not end > 0.0:
         raise InputError("the length must be positive", text, "give a positive number")
     return end, int(samples)
-
-
-def _section(period: float | None, end: float) -> "np.ndarray":
-    """Times within the run at which the drive has its initial phase."""
-    import numpy as np
-
-    if period is None:
-        return np.zeros(0)
-    return period * np.arange(np.floor(end / period) + 1.0)
 
 
 def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:

@@ -187,8 +187,16 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
                 "shorten guard, or state a level for each plateau of the trace",
             )
     means = np.array([trace[part].mean(axis=0) for part in parts])
-    correlation = abs(float(np.corrcoef(plateaus.levels, means[:, 0])[0, 1]))
-    _check_order(node["levels"], plateaus.levels, means[:, 0])
+    stated, reversed_ = (
+        float(np.corrcoef(order, means[:, 0])[0, 1]) for order in (plateaus.levels, plateaus.levels[::-1])
+    )
+    if reversed_ > stated and 1.0 - reversed_ < CLEARLY_LESS * (1.0 - stated):  # every sensitivity is positive
+        raise node["levels"].error(
+            "the levels must stand in the order of time, and the readings must increase with them",
+            f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order",
+            "reverse the levels, or state scale = -1 for a sensor of the other sign",
+        )
+    correlation = abs(stated)
     if not correlation >= SMALLEST_CORRELATION:
         raise node["levels"].error(
             f"the readings must follow the levels (correlation {SMALLEST_CORRELATION} or more)",
@@ -205,23 +213,6 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
 
     columns = (*means.T, plateaus.levels)
     return replace(raw, names=names, units=units, columns=columns, rows=raw.rows[starts], place=place)
-
-
-def _check_order(node: Node, levels: np.ndarray, means: np.ndarray) -> None:
-    """Refuse levels (k,) that fit the means (k,) of the parts in reverse order only: every sensitivity is positive.
-
-    Raises
-    ------
-    InputError
-        At the list of levels.
-    """
-    stated, reversed_ = (float(np.corrcoef(order, means)[0, 1]) for order in (levels, levels[::-1]))
-    if reversed_ > stated and 1.0 - reversed_ < CLEARLY_LESS * (1.0 - stated):
-        raise node.error(
-            "the levels must stand in the order of time, and the readings must increase with them",
-            f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order",
-            "reverse the levels, or state scale = -1 for a sensor of the other sign",
-        )
 
 
 def _check_constant(node: Node, trace: np.ndarray, parts: list[np.ndarray], means: np.ndarray) -> None:

@@ -71,7 +71,16 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     first, row = len(head) - 1, head.pop()
     delimiter = delimiter_of(row, layout)
     _refuse_ambiguous_comma(file, first, delimiter, layout)
-    _refuse_separator_in_quotes(file, first, row, delimiter)
+    for cell, position in cells_of(row, delimiter):
+        if cell.count('"') % 2:  # rows such as "10,2","1,5": the separator would cut quoted numbers in two
+            raise InputError(
+                "a cell in quotation marks must not hold the separator of the cells",
+                shown_cell(row.strip()),
+                "export with a decimal point, or with semicolons between the cells",
+                file.path,
+                first + 1,
+                position,
+            )
     *cells, last = texts_of(row, delimiter)
     blank = bool(cells) and not last
     trailing = blank and all(not texts_of(line, delimiter)[-1] for line in file.lines(first) if is_row(line))
@@ -231,20 +240,6 @@ def delimiter_of(line: str, layout: Layout) -> str | None:
     if all(_is_reading(cell, layout) for cell in _split(line, ",")):
         return ","
     return None if len(words) > 1 and all(_is_reading(word, layout) for word in words) else ","
-
-
-def _refuse_separator_in_quotes(file: TextFile, first: int, row: str, delimiter: str | None) -> None:
-    """Refuse rows such as ``"10,2","1,5"``: the separator would cut quoted numbers in two."""
-    for cell, position in cells_of(row, delimiter):
-        if cell.count('"') % 2:
-            raise InputError(
-                "a cell in quotation marks must not hold the separator of the cells",
-                shown_cell(row.strip()),
-                "export with a decimal point, or with semicolons between the cells",
-                file.path,
-                first + 1,
-                position,
-            )
 
 
 def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, layout: Layout) -> None:
