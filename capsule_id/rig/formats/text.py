@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import Content, Place, RawTable, TextFile, lines_of, occurrences, refuse_wide
@@ -177,7 +178,6 @@ def shown_cell(cell: str) -> str:
 COMMENTS = ("#", "%")
 _NO_CELLS = " \t\r\f\v\n,;"  # spreadsheets write blank rows as separators alone
 _PLAIN = "0123456789+-eE \t"  # characters of rows of numbers, without the separator and the decimal mark
-_SHORT = 1_000_000  # characters of a text that NumPy reads before pandas is imported
 
 
 @dataclass(frozen=True)
@@ -277,13 +277,7 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
 
 def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray | None:
     """The numbers of the columns of a text, correctly rounded; None where a cell is no number."""
-    usecols = None if delimiter is None else columns
     try:
-        if len(text) < _SHORT:
-            lines = io.StringIO(text.decode())
-            return np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
-        import pandas as pd
-
         with warnings.catch_warnings():
             # pandas 2 rounds correctly by this option alone; pandas 3 always does so, and warns of the option.
             warnings.simplefilter("ignore")
@@ -291,7 +285,7 @@ def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray
                 io.BytesIO(text),
                 sep=delimiter or r"\s+",
                 header=None,
-                usecols=usecols,
+                usecols=None if delimiter is None else columns,
                 dtype=np.float64,
                 na_filter=False,
                 quoting=csv.QUOTE_NONE,
