@@ -1,7 +1,6 @@
 """``capsule-id predict RESULT SETTINGS``: displacements at new settings, from a result with a progression."""
 
 import argparse
-from pathlib import Path
 
 from capsule_id.commands import PATH
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
@@ -32,8 +31,14 @@ def run(args: argparse.Namespace) -> int:
     """
     check_seed(args.seed)
     for option, file in (("--out", args.out), ("--figure", args.figure)):
-        if file is not None:
-            _check_new(option, file)
+        if file is None:
+            continue
+        with refusing(f"{option} must be writable", "name another file", file):
+            taken, room = file.exists(), file.parent.is_dir()
+        if taken:
+            raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
+        if not room:
+            raise InputError(f"{option} must stand in a directory", "there is none", f"make {file.parent}", file)
     if args.figure is not None and (
         args.figure.suffix.lower() != ".png" or args.figure.resolve() == args.out.resolve()
     ):
@@ -55,13 +60,3 @@ def run(args: argparse.Namespace) -> int:
             replace_file(file, content)
         say(f"wrote {file}: {counted(len(made.table), 'setting')}" if option == "--out" else f"wrote {file}")
     return 0
-
-
-def _check_new(option: str, file: Path) -> None:
-    """Refuse a file that exists or cannot be made, before the predictions are computed."""
-    with refusing(f"{option} must be writable", "name another file", file):
-        taken, room = file.exists(), file.parent.is_dir()
-    if taken:
-        raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
-    if not room:
-        raise InputError(f"{option} must stand in a directory", "there is none", f"make {file.parent}", file)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import Content, Place, RawTable, TextFile, lines_of, occurrences, refuse_wide
@@ -277,6 +276,8 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
 
 def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray | None:
     """The numbers of the columns of a text, correctly rounded; None where a cell is no number."""
+    import pandas as pd  # the command line starts without it
+
     try:
         with warnings.catch_warnings():
             # pandas 2 rounds correctly by this option alone; pandas 3 always does so, and warns of the option.
