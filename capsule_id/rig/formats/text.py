@@ -177,6 +177,7 @@ def shown_cell(cell: str) -> str:
 COMMENTS = ("#", "%")
 _NO_CELLS = " \t\r\f\v\n,;"  # spreadsheets write blank rows as separators alone
 _PLAIN = "0123456789+-eE \t"  # characters of rows of numbers, without the separator and the decimal mark
+_SHORT = 1_000_000  # characters of a text that NumPy reads before pandas is imported
 
 
 @dataclass(frozen=True)
@@ -276,9 +277,13 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
 
 def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray | None:
     """The numbers of the columns of a text, correctly rounded; None where a cell is no number."""
-    import pandas as pd  # the command line starts without it
-
+    usecols = None if delimiter is None else columns
     try:
+        if len(text) < _SHORT:
+            lines = io.StringIO(text.decode())
+            return np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
+        import pandas as pd
+
         with warnings.catch_warnings():
             # pandas 2 rounds correctly by this option alone; pandas 3 always does so, and warns of the option.
             warnings.simplefilter("ignore")
@@ -286,7 +291,7 @@ def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray
                 io.BytesIO(text),
                 sep=delimiter or r"\s+",
                 header=None,
-                usecols=None if delimiter is None else columns,
+                usecols=usecols,
                 dtype=np.float64,
                 na_filter=False,
                 quoting=csv.QUOTE_NONE,
