@@ -49,8 +49,7 @@ from capsule_id.report.figures.style import figure_of, subfigure_at
 from capsule_id.report.html import summary_html
 from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.netcdf import data_tree
-from capsule_id.report.saved import load as load_fields
-from capsule_id.report.write import result_files, table_frame, write_result
+from capsule_id.report.write import load_fields, result_files, table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding, Level, ResultTable
@@ -238,10 +237,9 @@ class Fit(Result):
         return _drawn(figures.force_on_rod, _named(records, name, attrgetter("name")), ax)
 
     def plot_corner(self, ax: Axes | None = None) -> Figure:
-        """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair: the figure."""
+        """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair, in the place of ``ax``: the figure."""
         columns = sampled_parameters(self)
-        _, width, height = figures.corner_size(len(columns.names))
-        return figure_of(_drawn(figures.corner, columns, ax, width, height))
+        return _drawn_in_panels(figures.corner, columns, ax, *figures.corner_size(columns))
 
     def plot_traces(self, ax: Axes | None = None) -> Figure:
         """A few walkers of each ensemble against the step, several panels in the place of ``ax``: the figure."""

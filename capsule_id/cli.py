@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from capsule_id import console
+from capsule_id.commands import add_options
 from capsule_id.commands.compilation import leave_cache, use_one_blas_thread
 from capsule_id.console import INTERRUPTED, end_interrupted, interruptible
 from capsule_id.errors import InputError, OutputError
@@ -49,7 +50,7 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
         "writes report.html. capsule-id init makes such a folder, capsule-id check examines it. Exit code 3: a check failed."
     )
     parser = _parser(program, text)
-    fit.add_arguments(parser)
+    add_options(parser, fit.OPTIONS)
     parser.set_defaults(run=fit.run)
     return parser
 
@@ -71,7 +72,7 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
         ("report", report, "the parameter table and findings of a result"),
     ):
         sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
-        module.add_arguments(sub)
+        add_options(sub, module.OPTIONS)
         sub.set_defaults(run=module.run)
     return parser
 

@@ -280,7 +280,11 @@ class Progress:
     def _show(self, line: str) -> None:
         line = printable(line)
         if self._notebook:
-            self._show_in_notebook(line)
+            bundle = {"text/plain": line}
+            if self._display is None:
+                self._display = import_module("IPython.display").display(bundle, raw=True, display_id=True)
+            else:
+                self._display.update(bundle, raw=True)
             return
         try:
             sys.stderr.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
@@ -288,13 +292,6 @@ class Progress:
         except OSError:
             self._enabled = False  # the stream is closed
         self._open = self._terminal
-
-    def _show_in_notebook(self, line: str) -> None:
-        bundle = {"text/plain": line}
-        if self._display is None:
-            self._display = import_module("IPython.display").display(bundle, raw=True, display_id=True)
-        else:
-            self._display.update(bundle, raw=True)
 
     def _end_line(self) -> None:
         if self._open and self._enabled:

@@ -244,16 +244,6 @@ def _first_with_unit(
     return next(((name, unit) for name, unit in units if unit is not None), None)
 
 
-def disordered_times(found: FoundLayout) -> tuple[str, int] | None:
-    """Header of a column of times that do not increase, and the first line where they do not; None without one."""
-    for index, values in found.columns.items():
-        name, text = found.header(index, ["s"])
-        if fits_name(name, TIME) > 0 and unit_of(text, ["s"]) is not None:
-            for row in np.flatnonzero(np.diff(values) <= 0.0):
-                return found.names[index], int(found.export.lines[row + 1])
-    return None
-
-
 def are_turning_points(values: np.ndarray) -> bool:
     """Whether the few readings of a table can be the amplitudes of a decay, on one side or on both sides in turn."""
     sizes, signs = np.abs(values), np.sign(values)
@@ -350,16 +340,15 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, file: str,
     if guessed is None:
         words = " ".join(kinds)
         headers = ", ".join(name for name in found.names if name) or "none"
-        times = disordered_times(found)
+        named = [(index, *found.header(index, ["s"])) for index in found.columns]
+        times = [index for index, name, text in named if fits_name(name, TIME) > 0 and unit_of(text, ["s"]) is not None]
+        falls = [(i, row + 1) for i in times for row in np.flatnonzero(np.diff(found.columns[i]) <= 0.0)[:1]]
         lines = [
             f"#: {file}: unsure. No kind fits its headers: {headers}.",
             *(
-                [
-                    f"#: Times must increase; {times[0]!r} does not at line {times[1]}. "
-                    "Export times with more digits, or correct the headers."
-                ]
-                if times
-                else []
+                f"#: Times must increase; {found.names[index]!r} does not at line {found.export.lines[row]}. "
+                "Export times with more digits, or correct the headers."
+                for index, row in falls[:1]
             ),
             *unread,
             f"#: Write one of {words}, and the columns of that kind.",

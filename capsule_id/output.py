@@ -52,21 +52,29 @@ def replace_file(path: Path, content: bytes | str, needed: int = 0) -> None:
     OutputError
         As ``write_file``.
     """
-    path = Path(os.path.realpath(path))  # a link stays
-    new = path.with_name(path.name + NEW)
+    replace_files({path: content}, needed)
+
+
+def replace_files(contents: Mapping[Path, bytes | str], needed: int = 0) -> None:
+    """As ``replace_file``; no file is renamed before all are written."""
+    files = [Path(os.path.realpath(path)) for path in contents]  # a link stays
+    new = [path.with_name(path.name + NEW) for path in files]
     try:
-        write_file(new, content, needed)
-        with writing(path):
-            new.replace(path)
+        for path, content in zip(new, contents.values(), strict=True):
+            write_file(path, content, needed)
+        for path, file in zip(new, files, strict=True):
+            with writing(file):
+                path.replace(file)
     except OutputError:
-        with suppress(OSError):
-            new.unlink()
+        for path in new:
+            with suppress(OSError):
+                path.unlink()
         raise
 
 
-def partial_directory(directory: Path) -> Path:
-    """``DIR.partial`` beside ``DIR``."""
-    return directory.with_name(directory.name + PARTIAL)
+def _beside(directory: Path, ending: str) -> Path:
+    """``DIR.partial``, ``DIR.partial.lock``, or ``DIR.partial.old``, where an older result lies while it is replaced."""
+    return directory.with_name(directory.name + ending)
 
 
 def check_directory(directory: Path) -> None:
@@ -84,7 +92,7 @@ def check_directory(directory: Path) -> None:
         raise InputError(named, f"'{directory}'", remedy)
     with refusing("the output directory must be usable", remedy, directory):
         _check_unfinished(directory, resume=False)
-        if _old(directory).exists():  # what holds a sample must not be hidden from the caller's checks
+        if _beside(directory, OLD).exists():  # what holds a sample must not be hidden from the caller's checks
             with _locked(directory):
                 _recover(directory)
         names = _names_in(directory, rule, remedy)
@@ -137,7 +145,7 @@ def work_in_progress(directory: Path, fingerprint: Mapping[str, object], resume:
         If there is nothing to resume, the saved state has other data, seed or versions, another run uses it, or
         ``DIR.partial`` is something else.
     """
-    partial = partial_directory(directory)
+    partial = _beside(directory, PARTIAL)
     with _locked(directory):
         new = not partial.exists()
         try:
@@ -162,7 +170,7 @@ def work_in_progress(directory: Path, fingerprint: Mapping[str, object], resume:
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
     """Hold the lock of ``directory``. The operating system releases it when this process ends."""
-    partial, lock = partial_directory(directory), FileLock(directory.with_name(directory.name + LOCK), blocking=False)
+    partial, lock = _beside(directory, PARTIAL), FileLock(_beside(directory, LOCK), blocking=False)
     missing = [path for path in directory.parents if not path.exists()]
     try:
         with _writable(partial):
@@ -191,7 +199,7 @@ def _check_unfinished(directory: Path, resume: bool) -> None:
 
     An older result lies there while it is replaced.
     """
-    partial, old = partial_directory(directory), _old(directory)
+    partial, old = _beside(directory, PARTIAL), _beside(directory, OLD)
     rule, remedy = "DIR.partial must be unfinished work", "move it away or choose another --out"
     with _writable(partial):
         if resume and not partial.exists():
@@ -204,14 +212,9 @@ def _check_unfinished(directory: Path, resume: bool) -> None:
             raise InputError("DIR.partial.old must be an older result", "it is something else", "move it away", old)
 
 
-def _old(directory: Path) -> Path:
-    """Where an older result lies while it is replaced and removed."""
-    return directory.with_name(directory.name + OLD)
-
-
 def _recover(directory: Path) -> None:
     """Restore the older result if a run died during its replacement; remove what is left of it after that."""
-    old = _old(directory)
+    old = _beside(directory, OLD)
     if not old.exists():
         return
     if directory.exists():
@@ -250,7 +253,7 @@ def publish(partial: Path, directory: Path) -> None:
     with writing(directory):
         try:
             if directory.exists():
-                directory.rename(_old(directory))
+                directory.rename(_beside(directory, OLD))
             partial.rename(directory)
         except OSError:
             _recover(directory)
@@ -258,4 +261,4 @@ def publish(partial: Path, directory: Path) -> None:
     for name in WORK_FILES:
         with suppress(OSError):
             (directory / name).unlink()
-    shutil.rmtree(_old(directory), ignore_errors=True)
+    shutil.rmtree(_beside(directory, OLD), ignore_errors=True)

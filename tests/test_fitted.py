@@ -25,7 +25,7 @@ from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import BLOCKS
 from capsule_id.inference.result import Pointwise, Posterior
-from capsule_id.report.saved import _digest
+from capsule_id.report.write import _digest
 from capsule_id.synthetic import truth_beside
 from capsule_id.views import Finding, Level
 from tests.cli_tools import DATA, listing, small_rig

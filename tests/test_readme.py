@@ -15,7 +15,7 @@ import capsule_id as cid
 from capsule_id import cli
 from capsule_id.experiments.kind import default_registry
 from capsule_id.parameters import Parameter
-from capsule_id.report import sentences as citation
+from capsule_id.report import html as citation
 from capsule_id.report.columns import COLUMNS
 from capsule_id.rig.model import ModelChoices
 from capsule_id.rig.schema import OPTIONAL

@@ -5,15 +5,16 @@ import logging
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from capsule_id.commands import PATH
 from capsule_id.commands.capsule_options import (
     DEFAULTS,
-    add_capsule_arguments,
     capsule_and_drive,
+    capsule_options,
     capsule_values,
     fitted_values,
     leaves_of,
@@ -23,7 +24,7 @@ from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import Progress, complain, saved, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
-from capsule_id.output import NEW, PARTIAL, check_parents, write_file
+from capsule_id.output import NEW, PARTIAL, check_parents, replace_files
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
@@ -74,32 +75,6 @@ def prepare_store(out: Path, resume: bool) -> Path:
         with refusing("FILE.nc.partial must be writable", "choose another --out", store):
             shutil.rmtree(store)
     return store
-
-
-def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
-    """Write both files under temporary names in the same folder, then rename them.
-
-    Raises
-    ------
-    InputError
-        If they cannot be written.
-    """
-    from capsule_id.report.figures.style import png
-    from capsule_id.report.netcdf import netcdf_bytes
-
-    files = out, out.with_suffix(".png")
-    new = [path.with_name(f".{path.name}{NEW}") for path in files]
-    try:
-        with refusing("the output must be writable", "choose another --out", out):
-            out.parent.mkdir(parents=True, exist_ok=True)
-            for path, content in zip(new, (netcdf_bytes(data), png(figure)), strict=True):
-                write_file(path, content)
-            for path, file in zip(new, files, strict=True):
-                path.replace(file)
-    finally:
-        for path in new:
-            with suppress(OSError):
-                path.unlink()
 
 
 # cluster: A Dask cluster for the blocks of a map or for rigs: threads or processes of this machine, or a running
@@ -158,7 +133,6 @@ def client_of(scheduler: str | None) -> "Iterator[Client | None]":
 
 # Defaults of the options: Table 1, with gap and drive of the paper's Fig. 6.
 FIG_6_DEFAULTS = {**DEFAULTS, "G": 1e-3, "P_d": 4.0, "Omega": 34.56}
-METHODS = ("rest", "states", "forward", "backward", "both")
 MOST_POINTS = 10_000_000
 
 
@@ -180,40 +154,42 @@ class Axis:
         return np.linspace(self.begin, self.end, self.points) * self.factor
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DATA and the options of quantities, motions and output. ``run`` parses all numbers."""
-    text = "fitted rig folder, for its parameters (default: Table 1)"
-    parser.add_argument("data", metavar="DATA", nargs="?", help=text)
-    group = parser.add_argument_group("varied quantities")
-    group.add_argument("--over", metavar="NAME", required=True, choices=tuple(SWEPT), help=", ".join(SWEPT))
-    group.add_argument("--from", dest="begin", metavar="X", required=True, help="first value")
-    group.add_argument("--to", dest="end", metavar="X", required=True, help="last value")
-    group.add_argument("--unit", metavar="U", help="of --from and --to, e.g. kN/m (default SI)")
-    group.add_argument("--points", metavar="N", help="number of values (default 500; 200 in a map)")
-    group.add_argument("--with", dest="second", metavar="NAME", choices=tuple(SWEPT), help="a second quantity: a map")
-    for word in ("from", "to", "unit", "points"):
-        group.add_argument(f"--with-{word}", metavar="X", help=f"--{word} of the second quantity")
-    group = parser.add_argument_group("motions")
-    text = "initial state: rest (default), many states, or the last state at the previous value"
-    group.add_argument("--method", choices=METHODS, default="rest", help=text)
-    group.add_argument("--states", metavar="N", default="16", help="initial states of --method states (default 16)")
-    text = "random seed of the initial states and of --draws (default 0)"
-    group.add_argument("--seed", metavar="N", default="0", help=text)
-    group.add_argument("--dropped", metavar="N", default="300", help="excitation periods dropped (default 300)")
-    group.add_argument("--observed", metavar="N", default="48", help="excitation periods observed (default 48)")
-    text = "s; contacts separated by less count as one (default 0: off)"
-    group.add_argument("--merge-contacts", metavar="X", default="0", help=text)
-    group.add_argument("--posterior", metavar="FILE", type=Path, help="posterior.nc: compute probabilities and bands")
-    group.add_argument("--draws", metavar="N", help="number of draws with --posterior (default 100)")
-    add_capsule_arguments(parser, FIG_6_DEFAULTS)
-    group = parser.add_argument_group("execution and output")
-    text = "Dask for maps and bands: threads, processes or an address tcp://..."
-    group.add_argument("--scheduler", metavar="S", help=text)
-    group.add_argument("--resume", action="store_true", help="reuse the finished blocks of an interrupted map")
-    group.add_argument("--quiet", action="store_true", help="no progress on standard error")
-    text = "FILE.nc; the figure is FILE.png (default results/<rig>-<quantity>.nc)"
-    group.add_argument("--out", metavar="FILE", type=Path, help=text)
-    add_cache_argument(group)
+_OVER = {"choices": tuple(SWEPT)}
+OPTIONS = {
+    "": (("data", "DATA", "fitted rig folder, for its parameters (default: Table 1)", {"nargs": "?"}),),
+    "varied quantities": (
+        ("--over", "NAME", ", ".join(SWEPT), {**_OVER, "required": True}),
+        ("--from", "X", "first value", {"dest": "begin", "required": True}),
+        ("--to", "X", "last value", {"dest": "end", "required": True}),
+        ("--unit", "U", "of --from and --to, e.g. kN/m (default SI)"),
+        ("--points", "N", "number of values (default 500; 200 in a map)"),
+        ("--with", "NAME", "a second quantity: a map", {**_OVER, "dest": "second"}),
+        *((f"--with-{word}", "X", f"--{word} of the second quantity") for word in ("from", "to", "unit", "points")),
+    ),
+    "motions": (
+        (
+            "--method",
+            None,
+            "initial state: rest (default), many states, or the last state at the previous value",
+            {"choices": ("rest", "states", "forward", "backward", "both"), "default": "rest"},
+        ),
+        ("--states", "N", "initial states of --method states (default 16)", {"default": "16"}),
+        ("--seed", "N", "random seed of the initial states and of --draws (default 0)", {"default": "0"}),
+        ("--dropped", "N", "excitation periods dropped (default 300)", {"default": "300"}),
+        ("--observed", "N", "excitation periods observed (default 48)", {"default": "48"}),
+        ("--merge-contacts", "X", "s; contacts separated by less count as one (default 0: off)", {"default": "0"}),
+        ("--posterior", "FILE", "posterior.nc: compute probabilities and bands", PATH),
+        ("--draws", "N", "number of draws with --posterior (default 100)"),
+    ),
+    **capsule_options(FIG_6_DEFAULTS),
+    "execution and output": (
+        ("--scheduler", "S", "Dask for maps and bands: threads, processes or an address tcp://..."),
+        ("--resume", "", "reuse the finished blocks of an interrupted map"),
+        ("--quiet", "", "no progress on standard error"),
+        ("--out", "FILE", "FILE.nc; the figure is FILE.png (default results/<rig>-<quantity>.nc)", PATH),
+        add_cache_argument,
+    ),
+}
 
 
 def run(args: argparse.Namespace) -> int:
@@ -241,7 +217,8 @@ def run(args: argparse.Namespace) -> int:
     store = prepare_store(out, args.resume)
     prepare_jax(not args.no_cache)
     from capsule_id.physics.forces import warn_of_far_gap
-    from capsule_id.report.figures.style import own_style
+    from capsule_id.report.figures.style import own_style, png
+    from capsule_id.report.netcdf import netcdf_bytes
 
     with Progress(not args.quiet, unit="point") as progress, client_of(args.scheduler) as client:
         data = _dataset(args, axes, values, {"store": store, "client": client, "progress": progress})
@@ -250,7 +227,10 @@ def run(args: argparse.Namespace) -> int:
         data.attrs["rig"] = rig.name if rig is not None else ""
         measured = _measured_points(args, rig, axes, values) if rig is not None else ()
         with own_style():
-            publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+            figure = png(draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+        with refusing("the output must be writable", "choose another --out", out):
+            out.parent.mkdir(parents=True, exist_ok=True)
+            replace_files({out: netcdf_bytes(data), out.with_suffix(".png"): figure})
     saved.clear()
     shutil.rmtree(store, ignore_errors=True)
     say(_summary_text(data, axes, out))

@@ -3,10 +3,11 @@
 import argparse
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from capsule_id.commands import PATH, Option
 from capsule_id.errors import InputError
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1
 
@@ -25,20 +26,20 @@ DEFAULTS: Mapping[str, float] = {
 }
 
 
-def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str, float] = DEFAULTS) -> None:
-    """Add an option per parameter, in SI, and the options for fitted values. ``capsule_values`` parses the numbers."""
-    group = parser.add_argument_group("parameters", "plain numbers in SI units")
-    group.add_argument("--drive", choices=tuple(DRIVES), default="harmonic", help="force on the rod (default harmonic)")
+def capsule_options(defaults: Mapping[str, float] = DEFAULTS) -> Mapping[str, Sequence[Option]]:
+    """An option per parameter, in SI, and the options for fitted values. ``capsule_values`` parses the numbers."""
+    rows: list[Option] = [
+        ("--drive", None, "force on the rod (default harmonic)", {"choices": tuple(DRIVES), "default": "harmonic"})
+    ]
     for name, leaf in LEAVES.items():
         text = "required" if leaf.default is None else f"default {leaf.describe_default()}"
         text = f"default {defaults[name]:g}" if name in defaults else text
         drives = [drive for drive, names in DRIVES.items() if name in names]
         only = f"; {drives[0]} drive" if len(drives) == 1 else ""
-        group.add_argument(f"--{name}", metavar="X", help=f"{leaf.meaning}, {leaf.unit} ({text}{only})")
-    group.add_argument(
-        "--result", metavar="DIR", type=Path, help="result directory of fit-params, for its fitted parameters"
-    )
-    group.add_argument("--spring", metavar="NAME", help="support spring of --result")
+        rows.append((f"--{name}", "X", f"{leaf.meaning}, {leaf.unit} ({text}{only})"))
+    rows.append(("--result", "DIR", "result directory of fit-params, for its fitted parameters", PATH))
+    rows.append(("--spring", "NAME", "support spring of --result"))
+    return {"parameters: plain numbers in SI units": rows}
 
 
 def capsule_values(

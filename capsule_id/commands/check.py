@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from capsule_id.commands import PATH
 from capsule_id.console import say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments import rough_values
@@ -16,11 +17,12 @@ from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig
 from capsule_id.views import Finding, counted
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DATA and the option of the figures."""
-    parser.add_argument("data", metavar="DATA", help="rig folder, with its rig.toml")
-    parser.add_argument("--figures", type=Path, metavar="DIR", help="draw every experiment with its findings into DIR")
+OPTIONS = {
+    "": (
+        ("data", "DATA", "rig folder, with its rig.toml"),
+        ("--figures", "DIR", "draw every experiment with its findings into DIR", PATH),
+    )
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from capsule_id.commands import PATH
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.commands.rigs import Options, fit_many, fit_one
 from capsule_id.console import Progress, say
@@ -19,42 +20,47 @@ from capsule_id.views import counted
 DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 1000
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DATA and the options."""
-    parser.add_argument("data", metavar="DATA", nargs="+", help="rig folder: rig.toml and the tables that it names")
-    text = "result directory (default results/<rig name>); of several rigs DIR/<rig name>"
-    parser.add_argument("--out", type=Path, metavar="DIR", help=text)
-    text = "Dask for several rigs: threads, processes or an address tcp://... (default: one after the other)"
-    parser.add_argument("--scheduler", metavar="S", help=text)
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="random seed (default 0); the same seed gives the same numbers"
+OPTIONS = {
+    "": (
+        ("data", "DATA", "rig folder: rig.toml and the tables that it names", {"nargs": "+"}),
+        ("--out", "DIR", "result directory (default results/<rig name>); of several rigs DIR/<rig name>", PATH),
+        (
+            "--scheduler",
+            "S",
+            "Dask for several rigs: threads, processes or an address tcp://... (default: one after the other)",
+        ),
+        (
+            "--seed",
+            "N",
+            "random seed (default 0); the same seed gives the same numbers",
+            {"type": int, "default": 0},
+        ),
+        ("--experiments", None, "experiments to fit (default all)", {"choices": CHOICES, "default": "all"}),
+        ("--resume", "", "continue an interrupted fit"),
+        ("--no-sample", "", "point fit only: no posterior, no intervals"),
+        (
+            "--max-steps",
+            "N",
+            f"most emcee steps per ensemble (default {DEFAULT_MAX_STEPS})",
+            {"type": int, "default": DEFAULT_MAX_STEPS},
+        ),
+        (
+            "--ess",
+            "N",
+            f"draw so many effectively independent samples of every parameter (default {DEFAULT_ESS})",
+            {"type": int, "default": DEFAULT_ESS},
+        ),
+        ("--json", "", "print parameters.json instead of the table"),
+        (
+            "--compare",
+            "WORDS",
+            "compare models instead of a fit: some of friction,reaction,lag,cubic; needs a progression. With --no-sample "
+            "roughly, by the point fits alone",
+        ),
+        ("--quiet", "", "no progress on standard error"),
+        add_cache_argument,
     )
-    parser.add_argument("--experiments", choices=CHOICES, default="all", help="experiments to fit (default all)")
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted fit")
-    parser.add_argument("--no-sample", action="store_true", help="point fit only: no posterior, no intervals")
-    parser.add_argument(
-        "--max-steps",
-        type=int,
-        default=DEFAULT_MAX_STEPS,
-        metavar="N",
-        help=f"most emcee steps per ensemble (default {DEFAULT_MAX_STEPS})",
-    )
-    parser.add_argument(
-        "--ess",
-        type=int,
-        default=DEFAULT_ESS,
-        metavar="N",
-        help=f"draw so many effectively independent samples of every parameter (default {DEFAULT_ESS})",
-    )
-    parser.add_argument("--json", action="store_true", help="print parameters.json instead of the table")
-    parser.add_argument(
-        "--compare",
-        metavar="WORDS",
-        help="compare models instead of a fit: some of friction,reaction,lag,cubic; needs a progression. With --no-sample "
-        "roughly, by the point fits alone",
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
-    add_cache_argument(parser)
+}
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,7 +71,10 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If the input is bad; then nothing is written.
     """
-    _check_numbers(args)
+    check_seed(args.seed)
+    for option, value in (("--max-steps", args.max_steps), ("--ess", args.ess)):
+        if value < 1:
+            raise InputError(f"{option} must be positive", str(value), "give 1 or more")
     kinds = default_registry()
     rigs = [read_rig(folder, kinds) for folder in args.data]
     if args.compare is not None:
@@ -85,14 +94,6 @@ def run(args: argparse.Namespace) -> int:
     directory = args.out or root / rigs[0].name
     with Progress(not args.quiet) as progress:
         return fit_one(rigs[0], options, directory, kinds, progress, resume=args.resume, as_json=args.json)
-
-
-def _check_numbers(args: argparse.Namespace) -> None:
-    """Refuse numbers that no fit has."""
-    check_seed(args.seed)
-    for option, value in (("--max-steps", args.max_steps), ("--ess", args.ess)):
-        if value < 1:
-            raise InputError(f"{option} must be positive", str(value), "give 1 or more")
 
 
 def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> int:

@@ -1,21 +1,20 @@
 """``capsule-id import FILE``: describe an export and propose the entry of ``rig.toml`` that reads it; writes nothing."""
 
 import argparse
-from pathlib import Path
 
+from capsule_id.commands import PATH
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
 from capsule_id.importing import clock_line, import_report, read_file
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add FILE, and the options of its clock."""
-    parser.add_argument("file", metavar="FILE", type=Path, help="table as a logger or a program exports it")
-    parser.add_argument(
-        "--clock-of", type=Path, metavar="OTHER", help="estimate the clock of FILE against that of OTHER"
+OPTIONS = {
+    "": (
+        ("file", "FILE", "table as a logger or a program exports it", PATH),
+        ("--clock-of", "OTHER", "estimate the clock of FILE against that of OTHER", PATH),
+        ("--common", "HEADER", "signal that both files hold, for --clock-of"),
     )
-    parser.add_argument("--common", metavar="HEADER", help="signal that both files hold, for --clock-of")
+}
 
 
 def run(args: argparse.Namespace) -> int:

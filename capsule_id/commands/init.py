@@ -76,13 +76,17 @@ def template(kinds: Registry, name: str, entries: Sequence[str] | None = None) -
     return "\n".join([head, *(entries or [kind.template for kind in kinds.values()])])
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DIR and the exports."""
-    parser.add_argument("dir", metavar="DIR", help="new or empty folder; with --from it may hold the files")
-    parser.add_argument(
-        "--from", dest="files", nargs="+", type=Path, default=[], metavar="FILE",
-        help="exports of loggers and programs: copy them into DIR and guess the entries that read them",
-    )  # fmt: skip
+OPTIONS = {
+    "": (
+        ("dir", "DIR", "new or empty folder; with --from it may hold the files"),
+        (
+            "--from",
+            "FILE",
+            "exports of loggers and programs: copy them into DIR and guess the entries that read them",
+            {"dest": "files", "nargs": "+", "type": Path, "default": []},
+        ),
+    )
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,23 +1,24 @@
 """``capsule-id predict RESULT SETTINGS``: displacements at new settings, from a result with a progression."""
 
 import argparse
-from pathlib import Path
 
+from capsule_id.commands import PATH
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import say
 from capsule_id.errors import InputError, check_seed, refusing
 from capsule_id.output import replace_file
 from capsule_id.views import counted
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add RESULT, SETTINGS and the options."""
-    parser.add_argument("result", metavar="RESULT", type=Path, help="result directory of fit-params")
-    parser.add_argument("settings", metavar="SETTINGS", type=Path, help="table of a progression without distance")
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="table of the predictions, a new file")
-    parser.add_argument("--figure", metavar="PNG", type=Path, help="mean velocities against period too, a new file")
-    parser.add_argument("--seed", type=int, default=0, help="random seed of the draws (default 0)")
-    add_cache_argument(parser)
+OPTIONS = {
+    "": (
+        ("result", "RESULT", "result directory of fit-params", PATH),
+        ("settings", "SETTINGS", "table of a progression without distance", PATH),
+        ("--out", "FILE", "table of the predictions, a new file", {**PATH, "required": True}),
+        ("--figure", "PNG", "mean velocities against period too, a new file", PATH),
+        ("--seed", None, "random seed of the draws (default 0)", {"type": int, "default": 0}),
+        add_cache_argument,
+    )
+}
 
 
 def run(args: argparse.Namespace) -> int:
@@ -30,8 +31,14 @@ def run(args: argparse.Namespace) -> int:
     """
     check_seed(args.seed)
     for option, file in (("--out", args.out), ("--figure", args.figure)):
-        if file is not None:
-            _check_new(option, file)
+        if file is None:
+            continue
+        with refusing(f"{option} must be writable", "name another file", file):
+            taken, room = file.exists(), file.parent.is_dir()
+        if taken:
+            raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
+        if not room:
+            raise InputError(f"{option} must stand in a directory", "there is none", f"make {file.parent}", file)
     if args.figure is not None and (
         args.figure.suffix.lower() != ".png" or args.figure.resolve() == args.out.resolve()
     ):
@@ -53,13 +60,3 @@ def run(args: argparse.Namespace) -> int:
             replace_file(file, content)
         say(f"wrote {file}: {counted(len(made.table), 'setting')}" if option == "--out" else f"wrote {file}")
     return 0
-
-
-def _check_new(option: str, file: Path) -> None:
-    """Refuse a file that exists or cannot be made, before the predictions are computed."""
-    with refusing(f"{option} must be writable", "name another file", file):
-        taken, room = file.exists(), file.parent.is_dir()
-    if taken:
-        raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
-    if not room:
-        raise InputError(f"{option} must stand in a directory", "there is none", f"make {file.parent}", file)

@@ -3,17 +3,18 @@
 import argparse
 import json
 import math
-from pathlib import Path
 from typing import Any
 
+from capsule_id.commands import PATH
 from capsule_id.console import one_line, say
 from capsule_id.errors import InputError
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DIR and the option of the format."""
-    parser.add_argument("directory", metavar="DIR", type=Path, help="result directory of fit-params")
-    parser.add_argument("--json", action="store_true", help="print parameters.json instead of the table")
+OPTIONS = {
+    "": (
+        ("directory", "DIR", "result directory of fit-params", PATH),
+        ("--json", "", "print parameters.json instead of the table"),
+    )
+}
 
 
 def run(args: argparse.Namespace) -> int:

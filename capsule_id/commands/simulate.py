@@ -2,11 +2,11 @@
 
 import argparse
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_and_drive, capsule_values, number
+from capsule_id.commands import PATH
+from capsule_id.commands.capsule_options import capsule_and_drive, capsule_options, capsule_values, number
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import complain, say
 from capsule_id.errors import InputError, refusing
@@ -23,23 +23,25 @@ PICTURE_SAMPLES = 20_000
 STATE = {"X1": "m", "Y1": "m/s", "X2": "m", "Y2": "m/s"}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options. ``run`` parses all numbers, so that errors name rule and remedy."""
-    add_capsule_arguments(parser)
-    group = parser.add_argument_group("run")
-    group.add_argument("--periods", metavar="N", help="length in excitation periods (default 20)")
-    group.add_argument("--duration", metavar="X", help="length in s, instead of --periods")
-    group.add_argument("--samples", metavar="N", default="2000", help="number of samples (default 2000)")
-    group.add_argument("--initial", nargs=4, metavar=tuple(STATE), help="state at the start, m and m/s (default: rest)")
-    group = parser.add_argument_group("model")
-    group.add_argument("--model", choices=["exact", "smooth"], default="exact", help="event-driven or smoothed")
-    group.add_argument("--semantics", choices=["stick-slip", "eq2"], default="stick-slip", help="eq2: smooth only")
-    for name, unit in WIDTHS.items():
-        group.add_argument(f"--{name}", metavar="X", help=f"of the smoothed model, {unit} (default: certified)")
-    group = parser.add_argument_group("output")
-    group.add_argument("--out", metavar="FILE", type=Path, required=True, help="table: FILE.csv or FILE.nc (NetCDF)")
-    group.add_argument("--figure", metavar="FILE", type=Path, help="figure: FILE.png")
-    add_cache_argument(group)
+OPTIONS = {
+    **capsule_options(),
+    "run": (
+        ("--periods", "N", "length in excitation periods (default 20)"),
+        ("--duration", "X", "length in s, instead of --periods"),
+        ("--samples", "N", "number of samples (default 2000)", {"default": "2000"}),
+        ("--initial", tuple(STATE), "state at the start, m and m/s (default: rest)", {"nargs": 4}),
+    ),
+    "model": (
+        ("--model", None, "event-driven or smoothed", {"choices": ["exact", "smooth"], "default": "exact"}),
+        ("--semantics", None, "eq2: smooth only", {"choices": ["stick-slip", "eq2"], "default": "stick-slip"}),
+        *((f"--{name}", "X", f"of the smoothed model, {unit} (default: certified)") for name, unit in WIDTHS.items()),
+    ),
+    "output": (
+        ("--out", "FILE", "table: FILE.csv or FILE.nc (NetCDF)", {**PATH, "required": True}),
+        ("--figure", "FILE", "figure: FILE.png", PATH),
+        add_cache_argument,
+    ),
+}
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
     if args.figure is not None:
         _check_suffix(args.figure, (".png",))
     values = capsule_values(args)
-    period = _period(values)
+    # A force that does not repeat has no period.
+    period = values.get("period", 2.0 * math.pi / values["Omega"] if values.get("Omega", 0.0) > 0.0 else None)
     end, samples = _length(args, period)
     X1, Y1, X2, Y2 = (number(name, text) for name, text in zip(STATE, args.initial or ["0"] * 4, strict=True))
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
@@ -72,7 +75,8 @@ def run(args: argparse.Namespace) -> int:
 
     p, e = capsule_and_drive(values, args.drive)
     grid = np.linspace(0.0, end, samples)
-    section = _section(period, end)
+    # Times at which the drive has its initial phase.
+    section = np.zeros(0) if period is None else period * np.arange(np.floor(end / period) + 1.0)
     # Impacts are short: the figure needs more samples than the table.
     drawn = np.linspace(0.0, end, PICTURE_SAMPLES) if args.figure is not None else section
     times = np.union1d(np.union1d(grid, section), drawn)
@@ -96,13 +100,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _period(values: Mapping[str, float]) -> float | None:
-    """Period of the drive, s; None for a force that does not repeat."""
-    if "period" in values:
-        return values["period"]
-    return 2.0 * math.pi / values["Omega"] if values["Omega"] > 0.0 else None
-
-
 def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]:
     """End of the run in s and number of samples."""
     if args.periods is not None and args.duration is not None:
@@ -120,15 +117,6 @@ def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]
     if not end > 0.0:
         raise InputError("the length must be positive", text, "give a positive number")
     return end, int(samples)
-
-
-def _section(period: float | None, end: float) -> "np.ndarray":
-    """Times within the run at which the drive has its initial phase."""
-    import numpy as np
-
-    if period is None:
-        return np.zeros(0)
-    return period * np.arange(np.floor(end / period) + 1.0)
 
 
 def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:

@@ -1,24 +1,21 @@
 """``capsule-id synthesize``: writes a rig folder with known truth."""
 
 import argparse
-from pathlib import Path
 
+from capsule_id.commands import PATH
 from capsule_id.console import say
 from capsule_id.errors import InputError, check_seed, refusing
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DIR and the options."""
-    parser.add_argument("directory", metavar="DIR", type=Path, help="new or empty folder")
-    parser.add_argument("--seed", type=int, default=0, help="random seed of the reading errors (default 0)")
-    parser.add_argument("--name", help="name of the rig (default: the folder's)")
-    parser.add_argument(
-        "--robot", action="store_true", help="a capsule robot with a progression instead of a bench rig"
+OPTIONS = {
+    "": (
+        ("directory", "DIR", "new or empty folder", PATH),
+        ("--seed", None, "random seed of the reading errors (default 0)", {"type": int, "default": 0}),
+        ("--name", None, "name of the rig (default: the folder's)"),
+        ("--robot", "", "a capsule robot with a progression instead of a bench rig"),
+        ("--runs", "", "add forced runs, computed with the exact model"),
+        ("--set", "NAME=VALUE", "true values, SI: k1=1500 'k2[soft]=2500'", {"nargs": "+", "default": []}),
     )
-    parser.add_argument("--runs", action="store_true", help="add forced runs, computed with the exact model")
-    parser.add_argument(
-        "--set", nargs="+", default=[], metavar="NAME=VALUE", help="true values, SI: k1=1500 'k2[soft]=2500'"
-    )
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -282,12 +282,6 @@ def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
     return tuple((numbers[0], numbers[-1]) for cells, numbers in runs if longest is not None and cells == longest)
 
 
-def _skips_rows(beginning: bytes, layout: Layout, first: int) -> bool:
-    """Whether rows like those of the longest block lie above the line ``first``."""
-    runs, longest = _runs(beginning.decode().splitlines(), layout)
-    return any(numbers[0] < first for cells, numbers in runs if longest is not None and cells == longest)
-
-
 def _runs(lines: Iterable[str], layout: Layout) -> tuple[list[tuple[Cells, list[int]]], Cells]:
     """Runs of lines with equal cells, their numbers counted from 1, and the cells of the longest run of two rows or more.
 
@@ -362,8 +356,9 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
             except InputError as error:
                 first = first or error
                 continue
-            if decimal == "." and not _names_columns(export):
-                continue
+            names = [name for row in export.headers[:1] for name in row if name.strip() and not is_number(name)]
+            if decimal == "." and not 1 < export.width == len(names):
+                continue  # whole numbers between commas are no decimals where the header names each of several columns
             columns, _, unread = _readings(export)
             if not columns and unread:
                 first = first or unread[min(unread)]
@@ -371,19 +366,12 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
                 rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
                 first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
             if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
-                if line is not None and _skips_rows(beginning, layout, line):
-                    break
+                runs, longest = _runs(beginning.decode().splitlines(), layout) if line is not None else ([], None)
+                if any(numbers[0] < (line or 0) for cells, numbers in runs if longest is not None and cells == longest):
+                    break  # rows like those of the longest block lie above the line
                 return layout
     assert first is not None, "every layout was refused"
     raise first
-
-
-def _names_columns(export: Export) -> bool:
-    """Whether the header has a name for each of several columns: whole numbers between commas are then no decimals."""
-    names = export.headers[0] if export.headers else ()
-    return (
-        export.width > 1 and len(names) == export.width and all(name.strip() and not is_number(name) for name in names)
-    )
 
 
 def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]:

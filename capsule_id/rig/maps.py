@@ -1,15 +1,15 @@
 """Column maps of ``rig.toml``: what they state, and the columns that they select, combine and scale."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
 from capsule_id.rig.formats.raw import Export, Layout, Place, RawTable
-from capsule_id.rig.model import Quantity
+from capsule_id.rig.model import NO_DRIFT, Quantity
 from capsule_id.rig.schema import ChoiceRule, ColumnRule, KindRule, PlainRule, QuantityRule, SettingRule, read_rules
 from capsule_id.rig.toml import ANY, Node, closest, is_count, is_number, shown
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si
@@ -29,57 +29,35 @@ _CLOCK: Mapping[str, SettingRule] = {
 LARGEST_OFFSET, LARGEST_DRIFT = 1e10, 0.1
 
 
-class StatedClock(NamedTuple):
-    """The clock t = offset + (1 + drift) t' of times t'; s and 1."""
-
-    offset: Quantity = Quantity(0.0)
-    drift: Quantity = Quantity(0.0)
-
-
-def read_clock(entry: Node) -> StatedClock | None:
-    """The clock of an experiment, None where it states none.
+def on_reference(node: Node, raw: RawTable) -> tuple[RawTable, Quantity]:
+    """The table with its times t' replaced by offset + (1 + drift) t', and the drift.
 
     Raises
     ------
     InputError
-        At the key or value that is wrong.
+        At the key or value of the clock that is wrong, or if the table has no times.
     """
-    if "clock" not in entry:
-        return None
-    node = entry["clock"].table(_CLOCK_EXAMPLE, tuple(_CLOCK))
+    node.table(_CLOCK_EXAMPLE, tuple(_CLOCK))
     if not node.value:
         raise node.error("a clock must have an offset or a drift", "none", f"write {_CLOCK_EXAMPLE}")
-    clock = StatedClock(**read_rules(node, _CLOCK))
-    for key, quantity, largest, unit, remedy in (
-        ("offset", clock.offset, LARGEST_OFFSET, " s", "check number and unit"),
-        ("drift", clock.drift, LARGEST_DRIFT, "", 'check number and unit; 20 ppm is { value = 20, unit = "ppm" }'),
+    stated = read_rules(node, _CLOCK)
+    for key, largest, unit, remedy in (
+        ("offset", LARGEST_OFFSET, " s", "check number and unit"),
+        ("drift", LARGEST_DRIFT, "", 'check number and unit; 20 ppm is { value = 20, unit = "ppm" }'),
     ):
+        quantity: Quantity = stated.setdefault(key, NO_DRIFT)
         for word, number in ((key, quantity.value), (f"sd of {key}", quantity.sd)):
             if abs(number) > largest:
                 raise node[key].error(
                     f"{word} must lie between -{largest:g}{unit} and {largest:g}{unit}", f"{number:g}{unit}", remedy
                 )
-    return clock
-
-
-def on_reference(entry: Node, raw: RawTable, clock: StatedClock) -> RawTable:
-    """The table with its times t' replaced by offset + (1 + drift) t'.
-
-    Raises
-    ------
-    InputError
-        If the table has no times.
-    """
     if "time" not in raw.names:
-        raise entry["clock"].error("clock needs a record with times", " ".join(raw.names), "remove clock", of_key=True)
-    index = raw.names.index("time")
-    try:
-        factor = factor_to_si(raw.units[index], "s")
-    except UnitError:  # reported at its place, where the column is converted
-        return raw
-    columns = list(raw.columns)
-    columns[index] = clock.offset.value / factor + (1.0 + clock.drift.value) * columns[index]
-    return replace(raw, columns=tuple(columns))
+        raise node.error("clock needs a record with times", " ".join(raw.names), "remove clock", of_key=True)
+    columns, index = list(raw.columns), raw.names.index("time")
+    with suppress(UnitError):  # reported at its place, where the column is converted
+        offset = stated["offset"].value / factor_to_si(raw.units[index], "s")
+        columns[index] = offset + (1.0 + stated["drift"].value) * columns[index]
+    return replace(raw, columns=tuple(columns)), stated["drift"]
 
 
 # declared: Reads the column map of an experiment in ``rig.toml``: ``columns`` and the keys that go with it.

@@ -1,7 +1,7 @@
 """Readings from plateaus of a time trace, and outliers that a stated rule drops."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -40,64 +40,53 @@ class DurationRule:
 
 _REJECT: Mapping[str, SettingRule] = {
     "rule": ChoiceRule(("hampel",)),
-    "n_sd": PlainRule(lambda value: is_number(value) and value >= 1, "be a number, 1 or more", "write n_sd = 5"),
     "window": DurationRule(),
+    "n_sd": PlainRule(lambda value: is_number(value) and value >= 1, "be a number, 1 or more", "write n_sd = 5"),
 }
 
 
-@dataclass(frozen=True)
-class Rejection:
-    """Hampel's rule: a sample further than ``n_sd`` robust sds from the median of ``window``, s, around it is dropped."""
+def without_outliers(node: Node, raw: RawTable, times: Callable[[RawTable], np.ndarray]) -> RawTable:
+    """The table without its outliers by Hampel's rule.
 
-    window: float
-    n_sd: float
-
-
-def read_rejection(entry: Node) -> Rejection | None:
-    """The rule of an experiment, None where it states none.
-
-    Raises
-    ------
-    InputError
-        At the key or value that is wrong.
-    """
-    if "reject" not in entry:
-        return None
-    node = entry["reject"].table(_REJECT_EXAMPLE, ("rule", "window", "n_sd"))
-    for key in ("rule", "window", "n_sd"):
-        node.required(key, f"write {_REJECT_EXAMPLE}")
-    stated = read_rules(node, _REJECT)
-    return Rejection(stated["window"], float(stated["n_sd"]))
-
-
-def outlying_rows(node: Node, raw: RawTable, time: np.ndarray, rejection: Rejection) -> np.ndarray:
-    """Whether a reading of each row is an outlier, (n,) bool.
+    A sample further than ``n_sd`` robust sds from the median of the ``window`` around it is dropped.
 
     Parameters
     ----------
-    node : of the window, for the error line
+    node : the rule
     raw : the table; its column ``time`` is not judged
-    time : (n,) s, increasing
+    times : gives its times, (n,) s, increasing
 
     Raises
     ------
     InputError
-        If the window holds less than two sampling steps, or does not fit into the record.
+        At a key or value of the rule; if the table has no times, or the window holds less than two sampling steps or does
+        not fit into the record.
     """
+    node.table(_REJECT_EXAMPLE, tuple(_REJECT))
+    for key in _REJECT:
+        node.required(key, f"write {_REJECT_EXAMPLE}")
+    stated = read_rules(node, _REJECT)
+    if "time" not in raw.names:
+        remedy = "remove reject, and correct or delete the rows"
+        raise node.error("reject needs a record with times", " ".join(raw.names), remedy, of_key=True)
+    time = times(raw)
     step = median_step(time) if len(time) > 1 else np.inf
-    half = rejection.window / step / 2.0
+    half = stated["window"] / step / 2.0
     if not 1.0 - 1e-9 <= half <= len(time) / 2.0:
-        raise node.error(
+        raise node["window"].error(
             "the window must hold two sampling steps or more, and fit into the record",
-            f"{rejection.window:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s",
+            f"{stated['window']:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s",
             "write a window of about 10 steps",
         )
-    samples = 2 * round(half) + 1
-    found = np.zeros(len(time), bool)
-    for name, values in zip(raw.names, raw.columns, strict=True):
-        if name != "time":
-            found |= hampel_outliers(values, samples, rejection.n_sd)
-    return found
+    judged = [column for name, column in zip(raw.names, raw.columns, strict=True) if name != "time"]
+    outlying = [hampel_outliers(values, 2 * round(half) + 1, float(stated["n_sd"])) for values in judged]
+    kept = np.flatnonzero(~np.any([np.zeros(len(time), bool), *outlying], axis=0))
+
+    def place(row: int | None, column: int) -> Place:
+        return raw.place(None if row is None else int(kept[row]), column)
+
+    columns = tuple(column[kept] for column in raw.columns)
+    return replace(raw, columns=columns, rows=raw.rows[kept], place=place, rejected=len(time) - len(kept))
 
 
 # plateaus: Makes readings of a time trace of steps: ``plateaus = { levels = [0, 10, 20], unit = "lbf", guard = "2 s"
@@ -198,8 +187,16 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
                 "shorten guard, or state a level for each plateau of the trace",
             )
     means = np.array([trace[part].mean(axis=0) for part in parts])
-    correlation = abs(float(np.corrcoef(plateaus.levels, means[:, 0])[0, 1]))
-    _check_order(node["levels"], plateaus.levels, means[:, 0])
+    stated, reversed_ = (
+        float(np.corrcoef(order, means[:, 0])[0, 1]) for order in (plateaus.levels, plateaus.levels[::-1])
+    )
+    if reversed_ > stated and 1.0 - reversed_ < CLEARLY_LESS * (1.0 - stated):  # every sensitivity is positive
+        raise node["levels"].error(
+            "the levels must stand in the order of time, and the readings must increase with them",
+            f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order",
+            "reverse the levels, or state scale = -1 for a sensor of the other sign",
+        )
+    correlation = abs(stated)
     if not correlation >= SMALLEST_CORRELATION:
         raise node["levels"].error(
             f"the readings must follow the levels (correlation {SMALLEST_CORRELATION} or more)",
@@ -216,23 +213,6 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
 
     columns = (*means.T, plateaus.levels)
     return replace(raw, names=names, units=units, columns=columns, rows=raw.rows[starts], place=place)
-
-
-def _check_order(node: Node, levels: np.ndarray, means: np.ndarray) -> None:
-    """Refuse levels (k,) that fit the means (k,) of the parts in reverse order only: every sensitivity is positive.
-
-    Raises
-    ------
-    InputError
-        At the list of levels.
-    """
-    stated, reversed_ = (float(np.corrcoef(order, means)[0, 1]) for order in (levels, levels[::-1]))
-    if reversed_ > stated and 1.0 - reversed_ < CLEARLY_LESS * (1.0 - stated):
-        raise node.error(
-            "the levels must stand in the order of time, and the readings must increase with them",
-            f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order",
-            "reverse the levels, or state scale = -1 for a sensor of the other sign",
-        )
 
 
 def _check_constant(node: Node, trace: np.ndarray, parts: list[np.ndarray], means: np.ndarray) -> None:

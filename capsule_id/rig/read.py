@@ -30,7 +30,7 @@ from capsule_id.rig.schema import (
     read_model,
     read_rules,
 )
-from capsule_id.rig.tables import read_experiment_files
+from capsule_id.rig.tables import read_table
 from capsule_id.rig.toml import NAME_PATTERN, Node, closest, parse_toml, shown
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
@@ -217,21 +217,18 @@ def _read_experiment(
         if key not in stated:
             raise entry.error(f"{kind.name} must have a {key}", "none", f"add {key} = ...")
     settings = kind.settings(**{**{key: value for key, value in ground.items() if key in rules}, **stated})
-    file = read_experiment_files(entry, kind)
     label = entry["label"].name() if "label" in entry else label
-    columns = {key: _with_reading_error(entry, column, kind) for key, column in file.columns.items()}
+    table, raw, sha256 = read_table(entry, kind, label, settings)
     for key in errors:
-        if key in entry and (column := key.rsplit("_", 1)[0]) not in columns:
+        if key in entry and (column := key.rsplit("_", 1)[0]) not in table.columns:
             raise entry[key].error(
-                f"{key} needs a column {column}", f"columns {' '.join(columns)}", "remove it", of_key=True
+                f"{key} needs a column {column}", f"columns {' '.join(table.columns)}", "remove it", of_key=True
             )
-    raw = file.raw
-    dropped = raw.missing, raw.other, raw.rejected, file.encodings, file.drift
-    name = next(iter(file.sha256))
-    table = Table(word, label, name, MappingProxyType(columns), settings, raw.rows, kind.bench, *dropped)
+    columns = {key: _with_reading_error(entry, column, kind) for key, column in table.columns.items()}
+    table = replace(table, columns=MappingProxyType(columns))
     for rule in kind.rules:
         rule(Entry(table, entry, raw))
-    return table, file.sha256
+    return table, sha256
 
 
 def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:

@@ -2,9 +2,9 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
 
@@ -13,12 +13,12 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import FEWEST_PERIODS, clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
-from capsule_id.rig.formats.raw import Layout, Place, RawTable, TextFile
+from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
 from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError
 from capsule_id.rig.guess import find_layout, proposal
-from capsule_id.rig.maps import apply_map, on_reference, read_clock, read_map
-from capsule_id.rig.model import NO_DRIFT, Column, Quantity
-from capsule_id.rig.plateaus import outlying_rows, read_plateaus, read_rejection, readings_of_plateaus
+from capsule_id.rig.maps import apply_map, on_reference, read_map
+from capsule_id.rig.model import NO_DRIFT, Column, Settings, Table
+from capsule_id.rig.plateaus import read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml import LARGEST, SMALLEST, Node, closest, is_plausible, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
@@ -73,26 +73,6 @@ def remedy_of_order(raw: RawTable, index: int) -> str:
 _A_TRIAL = "a row per trial"
 
 
-@dataclass(frozen=True)
-class TableFile:
-    """The table of an experiment.
-
-    Attributes
-    ----------
-    sha256 : of the bytes read, by name in ``rig.toml``, the first file first
-    raw : the table as written, without its numbers
-    columns : SI, by name, still without reading errors
-    encodings : of the texts, by name in ``rig.toml``
-    drift : of the clock, 1
-    """
-
-    sha256: Mapping[str, str]
-    raw: RawTable
-    columns: Mapping[str, Column]
-    encodings: Mapping[str, str]
-    drift: Quantity
-
-
 def table_path(node: Node) -> Path:
     """The path of the table that ``node`` names, a regular file inside the rig folder.
 
@@ -124,8 +104,10 @@ def table_path(node: Node) -> Path:
     return file
 
 
-def read_experiment_files(entry: Node, kind: KindRule) -> TableFile:
-    """Read the table of an experiment, by its column map if it has one, and check its columns.
+def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> tuple[Table, RawTable, dict[str, str]]:
+    """The table of an experiment, by its column map if it has one: its columns are checked, still without reading errors.
+
+    Also the table as written, without its numbers, and the sha256 of the bytes read by the names of the files.
 
     Raises
     ------
@@ -147,7 +129,7 @@ def read_experiment_files(entry: Node, kind: KindRule) -> TableFile:
                 "file must be readable", f"{shown(name)} ({error.strerror})", "check its permissions"
             ) from None
     first = files[nodes[0].value]
-    rejection, plateaus = read_rejection(entry), read_plateaus(entry, kind)
+    plateaus = read_plateaus(entry, kind)
     column_map = read_map(entry, kind, partial(_proposal, first, kind))
     if column_map is None:
         raw = _read_plain(nodes[0], first, kind)
@@ -163,22 +145,17 @@ def read_experiment_files(entry: Node, kind: KindRule) -> TableFile:
         encodings = {name: export.encoding for name, export in exports.items()}
         del exports
     drift = NO_DRIFT
-    if (clock := read_clock(entry)) is not None:
-        raw, drift = on_reference(entry, raw, clock), clock.drift
-    if rejection is not None:
-        if "time" not in raw.names:
-            raise entry["reject"].error(
-                "reject needs a record with times",
-                " ".join(raw.names),
-                "remove reject, and correct or delete the rows",
-                of_key=True,
-            )
-        raw = _with_rows(raw, ~outlying_rows(entry["reject"]["window"], raw, _times(raw), rejection))
+    if "clock" in entry:
+        raw, drift = on_reference(entry["clock"], raw)
+    if "reject" in entry:
+        raw = without_outliers(entry["reject"], raw, _times)
     if plateaus is not None:
         raw = readings_of_plateaus(entry["plateaus"], raw, _times(raw), plateaus)
     raw.rows.flags.writeable = False
     columns = {column: _to_si(raw, index, kind.columns[column]) for index, column in enumerate(raw.names)}
-    return TableFile(hashes, replace(raw, columns=()), columns, encodings, drift)
+    dropped = raw.missing, raw.other, raw.rejected, encodings, drift
+    table = Table(kind.name, label, nodes[0].value, columns, settings, raw.rows, kind.bench, *dropped)
+    return table, replace(raw, columns=()), hashes
 
 
 def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]:
@@ -266,17 +243,6 @@ def _proposal(file: Path, kind: KindRule, layout: Layout) -> str:
 def _times(raw: RawTable) -> np.ndarray:
     """The times of a record, (n,) s, increasing."""
     return _to_si(raw, raw.names.index("time"), ColumnRule("s", increasing=True)).values
-
-
-def _with_rows(raw: RawTable, keep: np.ndarray) -> RawTable:
-    """The table without outliers; ``keep`` (n,) are the other rows."""
-    origin = np.flatnonzero(keep)
-    columns = tuple(column[keep] for column in raw.columns)
-
-    def place(row: int | None, column: int) -> Place:
-        return raw.place(None if row is None else int(origin[row]), column)
-
-    return replace(raw, columns=columns, rows=raw.rows[keep], place=place, rejected=int(np.sum(~keep)))
 
 
 def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str, str, str], InputError]) -> None:

@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from itertools import count
 from math import inf, isfinite, pi
 from pathlib import Path
 from typing import Any
@@ -69,8 +70,10 @@ _STRING = r""""(?:[^"\\\n]|\\.)*"|'[^'\n]*'"""
 _MULTILINE = r""""{3}(?:[^\\]|\\.)*?"{3}(?:"{0,2})|'{3}.*?'{3}(?:'{0,2})"""
 _KEY = re.compile(rf"{_STRING}|[A-Za-z0-9_-]+")
 _VALUE = re.compile(rf"(?s:{_MULTILINE})|{_STRING}|[^,\]}}#\n]+")
-_BLANK = re.compile(r"(?:[ \t\n]|#[^\n]*)*")
-_SPACES = re.compile(r"[ \t]*")
+_NOTHING = r"(?:[ \t\n]|#[^\n]*)*"
+_BLANK, _COMMA, _OPEN = (re.compile(form + _NOTHING) for form in ("", rf"{_NOTHING},?", r"[\[{]"))
+_HEADER, _END, _DOT, _EQUALS = (re.compile(rf"[ \t]*{form}[ \t]*") for form in (r"\[\[?", r"\]\]?", r"\.", "="))
+_CLOSE = re.compile(r"[\]}]")
 
 
 @dataclass(frozen=True)
@@ -162,18 +165,6 @@ class _Scanner:
         self.text, self.position = text, 0
         self.keys: dict[KeyPath, int] = {}
         self.values: dict[KeyPath, int] = {}
-        self.lengths: dict[KeyPath, int] = {}  # of arrays of tables
-
-    def scan(self) -> None:
-        """Read every statement: table header or key = value."""
-        base: KeyPath = ()
-        self.skip(_BLANK)
-        while self.position < len(self.text):
-            if self.text.startswith("[", self.position):
-                base = self.header()
-            else:
-                self.key_value(base)
-            self.skip(_BLANK)
 
     def skip(self, pattern: re.Pattern[str]) -> str:
         """Move behind a match of ``pattern`` and return its text, which may be empty."""
@@ -181,66 +172,57 @@ class _Scanner:
         self.position = start if match is None else match.end()
         return self.text[start : self.position]
 
-    def header(self) -> KeyPath:
-        """``[a.b]`` or ``[[a.b]]``; the path that the following keys belong to."""
-        start = self.position
-        is_array = self.text.startswith("[[", start)
-        self.position += 2 if is_array else 1
-        path: KeyPath = ()
-        names = [name for name, _ in self.dotted_key()]
-        for depth, name in enumerate(names):
-            path = (*path, name)
-            if is_array and depth == len(names) - 1:
-                self.lengths[path] = self.lengths.get(path, 0) + 1
-                self.keys.setdefault(path, start)
-            if path in self.lengths:
-                path = (*path, self.lengths[path] - 1)
-        self.keys[path] = start
-        self.position += 2 if is_array else 1
-        return path
+    def scan(self) -> None:
+        """Read every statement: ``[a.b]``, ``[[a.b]]`` or key = value."""
+        base, last = KeyPath(), dict[KeyPath, KeyPath]()  # last: the table that a path of an array of tables means
+        self.skip(_BLANK)
+        while (start := self.position) < len(self.text):
+            if brackets := self.skip(_HEADER):
+                base, (*above, name) = (), [name for name, _ in self.dotted_key()]
+                for part in above:
+                    base = last.get((*base, part), (*base, part))
+                path = base = (*base, name)
+                if brackets.startswith("[["):
+                    self.keys.setdefault(path, start)
+                    last[path] = (*path, int(last[path][-1]) + 1 if path in last else 0)
+                base = last.get(path, path)
+                self.keys[base] = start
+                self.skip(_END)
+            else:
+                self.key_value(base)
+            self.skip(_BLANK)
 
     def dotted_key(self) -> list[tuple[str, int]]:
         """``a."b c".d``: the names with their offsets."""
         parts = []
-        while True:
-            self.skip(_SPACES)
+        while not parts or self.skip(_DOT):
             offset, token = self.position, self.skip(_KEY)
             parts.append((tomllib.loads(f"key = {token}")["key"] if token[0] in "\"'" else token, offset))
-            self.skip(_SPACES)
-            if not self.text.startswith(".", self.position):
-                return parts
-            self.position += 1
+        return parts
 
     def key_value(self, path: KeyPath) -> None:
         """``a.b = value``."""
         for name, offset in self.dotted_key():
             path = (*path, name)
             self.keys.setdefault(path, offset)
-        self.position += 1  # the equals sign
+        self.skip(_EQUALS)
         self.value(path)
 
     def value(self, path: KeyPath) -> None:
         """A string, array, inline table or bare word."""
-        self.skip(_SPACES)
         self.values[path] = self.position
-        closing = {"[": "]", "{": "}"}.get(self.text[self.position])
-        if closing is None:
+        bracket = self.skip(_OPEN)
+        if not bracket:
             self.skip(_VALUE)
             return
-        self.position += 1
-        self.skip(_BLANK)
-        index = 0
-        while not self.text.startswith(closing, self.position):
-            if closing == "]":
+        for index in count():
+            if self.skip(_CLOSE):
+                return
+            if bracket[0] == "[":
                 self.value((*path, index))
-                index += 1
             else:
                 self.key_value(path)
-            self.skip(_BLANK)
-            if self.text.startswith(",", self.position):
-                self.position += 1
-                self.skip(_BLANK)
-        self.position += 1
+            self.skip(_COMMA)
 
 
 # toml values: Reads single values of ``rig.toml``: type, unit, domain, SI. An error names the line and column of the

@@ -12,6 +12,7 @@ import xarray as xr
 from PIL import Image
 
 from capsule_id.cli import capsule_id
+from capsule_id.commands import add_options
 from capsule_id.commands import bifurcate as command
 from capsule_id.console import Progress
 from capsule_id.motions import sweep
@@ -228,7 +229,7 @@ def test_the_commands_of_the_guide_are_understood() -> None:
     lines = re.findall(r"^capsule-id bifurcate (.*)$", text, re.MULTILINE)
     assert len(lines) >= 4
     parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
+    add_options(parser, command.OPTIONS)
     for line in lines:
         args = parser.parse_args(shlex.split(line))
         axes = command._axes(args)

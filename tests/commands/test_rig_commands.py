@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from capsule_id.api import read_rig
-from capsule_id.commands import check, init
+from capsule_id.commands import add_options, check, init
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
 from capsule_id.rig.schema import ChoiceRule
@@ -20,7 +20,7 @@ KINDS = default_registry()
 def call(command: object, *words: str) -> int:
     """Run a command as the command line does."""
     parser = argparse.ArgumentParser()
-    command.add_arguments(parser)  # type: ignore[attr-defined]
+    add_options(parser, command.OPTIONS)  # type: ignore[attr-defined]
     return command.run(parser.parse_args(words))  # type: ignore[attr-defined]
 
 

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 from PIL import Image
 
+from capsule_id.commands import add_options
 from capsule_id.commands import capsule_options as options
 from capsule_id.commands import simulate as command
 from capsule_id.errors import InputError
@@ -22,7 +23,7 @@ DRIVE = ["--k2", "18960", "--G", "1e-3", "--P_d", "4", "--Omega", "34.56"]
 
 def _run(*arguments: str) -> int:
     parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
+    add_options(parser, command.OPTIONS)
     return command.run(parser.parse_args(arguments))
 
 
@@ -64,7 +65,7 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     rows = {"k1": {"map": 1500.0, "median": None}, "k2[L60]": {"map": 2e4}, "K": {"map": 20.0}}
     (tmp_path / "parameters.json").write_text(json.dumps({"parameters": rows}), encoding="utf-8")
     parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
+    add_options(parser, command.OPTIONS)
     drive = ["--G", "1e-3", "--P_d", "4", "--Omega", "30", "--out", "x.csv", "--result", str(tmp_path)]
     values = options.capsule_values(parser.parse_args([*drive, "--c", "5"]))
     assert (values["k1"], values["k2"], values["c"], values["m1"]) == (1500.0, 2e4, 5.0, 0.11)

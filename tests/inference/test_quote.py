@@ -12,8 +12,7 @@ from capsule_id.api import Fit
 from capsule_id.inference.result import Result
 from capsule_id.inference.tables import _limited, quote
 from capsule_id.report.columns import table_rows, table_text
-from capsule_id.report.html import render
-from capsule_id.report.sentences import latex_table, methods_paragraph
+from capsule_id.report.html import latex_table, methods_paragraph, render
 from capsule_id.report.write import parameters_json
 from tests.report.conftest import make_result
 

@@ -6,7 +6,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.inference.result import STATED, Result
-from capsule_id.report.sentences import next_steps
+from capsule_id.report.html import next_steps
 from tests.cli_tools import DATA
 
 RECORDS = [f"free_vibration_{i}" for i in (1, 2, 3)]

@@ -32,10 +32,10 @@ def drawn(panel: Callable[..., None], data: object, **size: float) -> Axes:
     return ax
 
 
-def corner_of(result: Result) -> Axes:
+def corner_of(result: Result) -> Figure:
     columns = sampled_parameters(result)
-    figures.corner(columns, ax := figures.corner_axes(len(columns.names)))
-    return ax
+    figures.corner(columns, figure := new_figure(*figures.corner_size(columns)))
+    return figure
 
 
 def traces_of(result: Result) -> Figure:
@@ -63,8 +63,8 @@ def test_every_panel_has_labels_with_units(result: Result) -> None:
 
 
 def test_corner_names_every_physical_parameter_with_its_unit(result: Result) -> None:
-    ax = corner_of(result)
-    labels = [text.get_text() for text in ax.texts if "[" in text.get_text()]
+    axes = corner_of(result).axes
+    labels = [label for ax in axes for label in (ax.get_xlabel(), ax.get_ylabel()) if "[" in label]
     # Each on the horizontal axis, and all but the first, which has a histogram in its row, on the vertical one.
     assert len(labels) == 2 * len(result.summary) - 1
     assert {"m₁\n[kg]", "k₂ stiff\n[N/m]", "vₛ\n[m/s]", "μ\n[1]"} <= set(labels)
@@ -100,34 +100,34 @@ def _inside(polygons: list[np.ndarray], points: np.ndarray) -> np.ndarray:
 def test_contours_hold_the_shares_they_claim(maker: Callable[..., Result]) -> None:
     result = maker(draws=250, walkers=32)
     posterior = cast(Posterior, result.posterior)
-    ax = corner_of(result)
-    n = len(result.summary)
+    panel = corner_of(result).axes[1]  # of row 1, column 0
     draws = posterior.draws.reshape(-1, len(posterior.names))[:, :2]
-    low, high = np.percentile(draws, (0.1, 99.9), axis=0)
-    width = high - low
-    place = (draws - (low - 0.02 * width)) / (1.04 * width) * 0.94 + (0, n - 2)  # panel of row 1, column 0
-    (contours,) = [item for item in ax.collections if type(item).__name__ == "QuadContourSet"]
+    (contours,) = [item for item in panel.collections if type(item).__name__ == "QuadContourSet"]
     for path, share in zip(contours.get_paths(), (0.95 - 0.68, 0.68), strict=True):
-        here = [p for p in path.to_polygons() if p[:, 0].max() < 1 and n - 2 < p[:, 1].min() and p[:, 1].max() < n - 1]
         # Smoothing over five bins widens a contour a little; 3 % is the tolerance of the eye, not of the table.
-        assert _inside(here, place).mean() == pytest.approx(share, abs=0.03)
+        assert _inside(path.to_polygons(), draws).mean() == pytest.approx(share, abs=0.03)
 
 
 @pytest.mark.parametrize(
     ("low", "high"), [(0.0, 1.0), (1418.2, 1424.9), (-3e-4, 7e-4), (56399.0, 56401.0), (1e-9, 1e9)]
 )
-def test_corner_ticks_are_distinct_inside_and_say_where_they_are(low: float, high: float) -> None:
-    ticks = figures._ticks(low, high)
-    values = np.array([value for value, _ in ticks])
-    assert 2 <= len(ticks) <= 5
-    assert np.all((low < values) & (values < high))
-    np.testing.assert_allclose([float(text) for _, text in ticks], values, rtol=0, atol=1e-9 * (high - low))
+def test_corner_ticks_are_distinct_inside_and_say_where_they_are(result: Result, low: float, high: float) -> None:
+    columns = sampled_parameters(result)
+    draws = np.linspace(low, high, columns.draws.size).reshape(columns.draws.shape)
+    figures.corner(dataclasses.replace(columns, draws=draws), figure := new_figure(*figures.corner_size(columns)))
+    axis = figure.axes[-1].xaxis
+    ends, texts = axis.get_view_interval(), [text.get_text() for text in axis.get_ticklabels()]
+    shown = [(value, text) for value, text in zip(axis.get_ticklocs(), texts, strict=True) if ends[0] < value < ends[1]]
+    values = np.array([value for value, _ in shown])
+    assert 2 <= len(shown) <= 5
+    said = [float(text.replace("−", "-")) for _, text in shown]
+    np.testing.assert_allclose(said, values, rtol=0, atol=1e-9 * (high - low))
 
 
 def test_a_frozen_chain_is_drawn(result: Result) -> None:
     posterior = cast(Posterior, result.posterior)
     frozen = dataclasses.replace(posterior, draws=np.broadcast_to(posterior.draws[:1, :1, :1], posterior.draws.shape))
-    assert png(figure_of(corner_of(dataclasses.replace(result, posterior=frozen))))
+    assert png(corner_of(dataclasses.replace(result, posterior=frozen)))
     assert png(traces_of(dataclasses.replace(result, posterior=frozen)))
 
 
@@ -135,7 +135,7 @@ def test_a_frozen_chain_is_drawn(result: Result) -> None:
 def test_few_parameters(result: Result, count: int) -> None:
     few = dataclasses.replace(result, summary=result.summary.iloc[:count])
     assert len(traces_of(few).axes) == count  # an empty panel is none
-    assert png(figure_of(corner_of(few)))
+    assert png(corner_of(few))
 
 
 def test_no_sample_is_refused(unsampled: Result) -> None:

@@ -14,9 +14,8 @@ from capsule_id.api import read_rig
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.report.columns import table_rows, verdict_text
-from capsule_id.report.html import Picture, pictures, render
+from capsule_id.report.html import Picture, methods_paragraph, pictures, render
 from capsule_id.report.messages import TERMS, finding_text, messages_of
-from capsule_id.report.sentences import methods_paragraph
 from capsule_id.views import Finding, Message, ResultTable, Text
 from tests.cli_tools import DATA
 from tests.report.conftest import OUTLIER

@@ -3,14 +3,12 @@
 A panel is ``(data, ax)`` and draws into ``ax``; labels are plain text.
 """
 
-import math
 from collections.abc import Sequence
 from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -20,7 +18,7 @@ from scipy import ndimage
 from capsule_id.experiments.context import RunRecord
 from capsule_id.inference.result import PointFit
 from capsule_id.records.view import MotionView
-from capsule_id.report.columns import SampledParameters, fixed, plain_symbol
+from capsule_id.report.columns import SampledParameters, plain_symbol
 from capsule_id.report.figures.style import (
     BLACK,
     BLUE,
@@ -373,161 +371,85 @@ def overview(view: MotionView, figure: Figure | SubFigure) -> None:
 
 
 # corner: Corner plot: a histogram of every parameter, contours of every pair.
-#
-# All panels lie in one ``Axes`` and all contours are those of one field: with an ``Axes`` a panel, ten parameters would
-# cost more time than all other figures of the report together.
 
 
 _BINS = 40
-# Shares of the draws inside the contours, from outside in.
-_SHARES = (0.95, 0.68)
+# Levels of the share of the draws at lower density: the contours hold 95 % and 68 %.
+_LEVELS = (0.05, 0.32, 1.0)
 # A panel shows the central 99.8 %: one stray walker must not shrink everything else to a dot.
 _TAILS = (0.1, 99.9)
-# Panels are squares of this side on a grid of unit cells.
-_SIDE = 0.94
-# No tick in the outer tenths of a side: its label would run into the neighbour's.
-_TICK_MARGIN = 0.1
 
 
-def corner_size(n: int) -> tuple[float, float, float]:
-    """Width of a panel, width and height of the figure of ``n`` parameters, inches."""
-    panel = 2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
+def corner_size(columns: SampledParameters) -> tuple[float, float]:
+    """Width and height of ``corner``, inches."""
+    n = len(columns.names)
+    panels = n * (2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n)))
     # The key stands in the empty upper triangle, or above the panels where that is too small.
-    return panel, 1.25 + panel * n, 1.25 + panel * n + (0.8 if n <= 2 else 0.0)
+    return 1.6 + panels, 1.25 + panels + (0.9 if n <= 2 else 0.0)
 
 
-def corner_axes(n: int) -> Axes:
-    """The axes of a corner plot of ``n`` parameters in a figure of its own."""
-    panel, width, height = corner_size(n)
-    place = (1.1 / width, 1.0 / height, panel * n / width, panel * n / height)
-    return new_figure(width, height).add_axes(place)
-
-
-def corner(columns: SampledParameters, ax: Axes) -> None:
+def corner(columns: SampledParameters, figure: Figure | SubFigure) -> None:
     """Histogram of every sampled physical parameter and contours (68 %, 95 %) of every pair.
 
     The point fit is marked in black, the paper's estimate, where it lies in the picture, in vermilion.
     """
-    n = len(columns.names)
-    ax.set(xlim=(0, n), ylim=(0, n), xticks=[], yticks=[], frame_on=False)
-    low, high = _limits(columns)
-    flat = columns.draws.reshape(-1, n)
-    place = (flat - low) / (high - low) * _BINS
-    inside = (place >= 0) & (place < _BINS)
-    bins = np.clip(place, 0, _BINS - 1).astype(np.int64)
-    _contours(ax, bins, inside)
-    _histograms(ax, bins, inside)
-    square = np.array([(0.0, 0.0), (_SIDE, 0.0), (_SIDE, _SIDE), (0.0, _SIDE), (0.0, 0.0)])
-    frames = [np.add(square, (j, n - 1 - i)) for i in range(n) for j in range(i + 1)]
-    ax.add_collection(LineCollection(frames, colors=BLACK, lw=0.9, clip_on=False))
-    _marks(ax, (columns.map - low) / (high - low), BLACK, "+", "-")
-    _marks(ax, (columns.paper - low) / (high - low), VERMILION, "x", "--")
-    _axes(ax, columns, low, high, ax.get_window_extent().width / figure_of(ax).dpi / n)
-    above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)} if n <= 2 else {"loc": "upper right"}
+    n, flat = len(columns.names), columns.draws.reshape(-1, len(columns.names))
+    set_margins(figure, left=1.25, right=0.35, bottom=1.0, top=1.15 if n <= 2 else 0.25)
+    grid, ends = figure.add_gridspec(n, n, wspace=0.06, hspace=0.06), _ends(columns)
+    for i, j in ((row, column) for row in range(n) for column in range(row + 1)):
+        ax = figure.add_subplot(grid[i, j], xticks=[], yticks=[])
+        for mark, color, marker, line in ((columns.map, BLACK, "+", "-"), (columns.paper, VERMILION, "x", "--")):
+            if i == j:
+                ax.axvline(mark[j], color=color, ls=line, lw=1.3, zorder=4)
+            else:
+                ax.plot(mark[j], mark[i], ls="", marker=marker, color=color, ms=7, mew=1.4, zorder=4)
+        if i == j:
+            counts, edges = np.histogram(flat[:, j], _BINS, ends[j])
+            ax.stairs(counts, edges, color=PALE_BLUE, fill=True)
+            ax.stairs(counts, edges, color=BLUE, lw=1.2)
+            ax.set_ylim(0.0, 1.08 * max(counts.max(), 1))
+        else:
+            _contours(ax, flat[:, [j, i]], ends[[j, i]])
+            ax.set_ylim(*ends[i])
+        ax.set_xlim(*ends[j])
+        for axis, k, shown in ((ax.xaxis, j, i == n - 1), (ax.yaxis, i, j == 0 < i)):
+            if shown:
+                axis.set_major_locator(MaxNLocator(4, prune="both"))
+                axis.set_label_text(f"{columns.symbols[k]}\n[{columns.units[k]}]", fontsize=TEXT, parse_math=False)
+        ax.tick_params(labelsize=SMALL - 0.5, length=3)
+        ax.tick_params("x", labelrotation=40)
+        ax.ticklabel_format(useOffset=False, style="plain")
+    figure.align_labels()
     key = (
         Patch(color=BLUE, label="68 % of the draws"),
         Patch(color=PALE_BLUE, label="95 % of the draws"),
         Line2D([], [], color=BLACK, marker="+", ms=9, mew=1.4, label="point fit (MAP)"),
         Line2D([], [], color=VERMILION, ls="--", marker="x", label="the paper's estimate, where in range"),
     )
-    set_legend(ax, handles=key, fontsize=TEXT, handlelength=2.0, borderaxespad=0.2, **above)
+    place: dict[str, Any] = {"bbox_to_anchor": (0.99, 0.98), "bbox_transform": figure.transSubfigure}
+    set_legend(figure.axes[0], "beside", key, fontsize=TEXT, handlelength=2.0, **place | {"loc": "upper right"})
 
 
-def _limits(columns: SampledParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of every panel's axis, (n,) each."""
+def _ends(columns: SampledParameters) -> np.ndarray:
+    """Ends of every panel's axis, (n, 2)."""
     low, high = np.percentile(columns.draws.reshape(-1, len(columns.names)), _TAILS, axis=0)
     # A parameter that never moved (a frozen chain) still gets a panel of some width.
     width = np.where(high > low, high - low, np.where(high == 0, 1.0, np.abs(high)))
-    return low - 0.02 * width, low + 1.02 * width
+    return np.column_stack([low - 0.02 * width, low + 1.02 * width])
 
 
-def _contours(ax: Axes, bins: np.ndarray, inside: np.ndarray) -> None:
-    """Filled contours of every pair at once: a field over the whole picture, zero between the panels.
+def _contours(ax: Axes, pair: np.ndarray, ends: np.ndarray) -> None:
+    """Filled contours of the density of a pair, (draws, 2).
 
-    The field is the share of the draws at lower density, so that the same two levels hold in every panel.
+    Smoothing over five bins each way lets them follow the density and not the counting noise.
     """
-    n = bins.shape[1]
-    field = np.zeros((n, _BINS + 2, n, _BINS + 2))
-    for i in range(1, n):
-        for j in range(i):
-            both = inside[:, i] & inside[:, j]
-            counts = np.bincount(bins[both, i] * _BINS + bins[both, j], minlength=_BINS * _BINS)
-            density = _smoothed(counts.reshape(_BINS, _BINS).astype(float))
-            order = np.argsort(density, axis=None, kind="stable")
-            share = np.empty(order.size)
-            share[order] = np.cumsum(density.flat[order]) / max(density.sum(), 1.0)
-            field[n - 1 - i, 1:-1, j, 1:-1] = share.reshape(_BINS, _BINS)
-    edge = np.concatenate([[0.0], (np.arange(_BINS) + 0.5) / _BINS, [1.0]]) * _SIDE
-    centres = (np.arange(n)[:, np.newaxis] + edge).ravel()
-    levels = [1 - share for share in _SHARES] + [1.0]
-    size = n * (_BINS + 2)
-    ax.contourf(centres, centres, field.reshape(size, size), levels=levels, colors=[PALE_BLUE, BLUE])
-
-
-def _smoothed(counts: np.ndarray) -> np.ndarray:
-    """Binomial smoothing over five bins each way, so that contours follow the density and not the counting noise."""
-    kernel = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
-    rows = ndimage.convolve1d(counts, kernel, axis=0, mode="constant")
-    return ndimage.convolve1d(rows, kernel, axis=1, mode="constant")
-
-
-def _histograms(ax: Axes, bins: np.ndarray, inside: np.ndarray) -> None:
-    n = bins.shape[1]
-    for i in range(n):
-        counts = np.bincount(bins[inside[:, i], i], minlength=_BINS)
-        base = n - 1 - i
-        heights = base + 0.92 * _SIDE * counts / max(counts.max(), 1)
-        edges = i + np.linspace(0.0, _SIDE, _BINS + 1)
-        ax.stairs(heights, edges, baseline=base, color=PALE_BLUE, fill=True)
-        ax.stairs(heights, edges, baseline=base, color=BLUE, lw=1.2)
-
-
-def _marks(ax: Axes, place: np.ndarray, color: str, marker: str, line: str) -> None:
-    """A point in every pair and a line in every histogram; ``place`` (n,) counts from 0 to 1 along a panel's side."""
-    n = place.size
-    shown = np.flatnonzero((place > 0) & (place < 1))
-    pairs = [(j + _SIDE * place[j], n - 1 - i + _SIDE * place[i]) for i in shown for j in shown if j < i]
-    if pairs:
-        ax.plot(*np.transpose(pairs), ls="", marker=marker, color=color, ms=7, mew=1.4, zorder=4)
-    x = shown + _SIDE * place[shown]
-    ax.vlines(x, n - 1.0 - shown, n - 1.0 - shown + _SIDE, color=color, ls=line, lw=1.3, zorder=4)
-
-
-def _axes(ax: Axes, columns: SampledParameters, low: np.ndarray, high: np.ndarray, panel: float) -> None:
-    """Ticks and labels along the bottom, and on the left from the second row on (a histogram has no y-axis).
-
-    ``panel`` is the width of a cell in inches: text keeps its distance in inches whatever the size of the cells.
-    """
-    n = len(columns.names)
-    length, gap, away = 0.035 / panel, 0.06 / panel, 0.6 / panel
-    ticks: list[tuple[tuple[float, float], tuple[float, float]]] = []
-    small: dict[str, Any] = {"fontsize": SMALL - 0.5}
-    label: dict[str, Any] = {"fontsize": TEXT * min(1.0, panel), "parse_math": False}
-    for i in range(n):
-        for value, text in _ticks(low[i], high[i]):
-            place = _SIDE * (value - low[i]) / (high[i] - low[i])
-            ticks.append(((i + place, 0.0), (i + place, -length)))
-            ax.text(i + place + gap, -gap, text, rotation=40, ha="right", va="top", rotation_mode="anchor", **small)
-            if i > 0:
-                y = n - 1 - i + place
-                ticks.append(((0.0, y), (-length, y)))
-                ax.text(-gap, y, text, ha="right", va="center", **small)
-        name = f"{columns.symbols[i]}\n[{columns.units[i]}]"
-        ax.text(i + _SIDE / 2, -away, name, ha="center", va="top", **label)
-        if i > 0:
-            y = n - 1 - i + _SIDE / 2
-            ax.text(-away, y, name, ha="right", va="center", rotation=90, multialignment="center", **label)
-    ax.add_collection(LineCollection(ticks, colors=GREY, lw=0.8, clip_on=False))
-
-
-def _ticks(low: float, high: float) -> list[tuple[float, str]]:
-    """Two to four round values inside the panel, with the decimals that tell them apart."""
-    start, stop = low + _TICK_MARGIN * (high - low), high - _TICK_MARGIN * (high - low)
-    power = math.floor(math.log10(high - low))
-    steps = ((exponent, digit * 10.0**exponent) for exponent in (power, power - 1) for digit in (5, 2, 1))
-    exponent, step = next((e, step) for e, step in steps if math.floor(stop / step) > math.ceil(start / step))
-    multiples = range(math.ceil(start / step), math.floor(stop / step) + 1)
-    return [(k * step, fixed(k * step, max(-exponent, 0))) for k in multiples]
+    counts, *edges = np.histogram2d(pair[:, 0], pair[:, 1], _BINS, ends.tolist())
+    for axis in (0, 1):
+        counts = ndimage.convolve1d(counts, np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0, axis=axis, mode="constant")
+    order, share = np.argsort(counts, axis=None, kind="stable"), np.empty(counts.size)
+    share[order] = np.cumsum(counts.flat[order]) / max(counts.sum(), 1.0)
+    x, y = (0.5 * (edge[1:] + edge[:-1]) for edge in edges)
+    ax.contourf(x, y, share.reshape(counts.shape).T, levels=_LEVELS, colors=[PALE_BLUE, BLUE])
 
 
 # traces: Traces of the sample: they show drift, and ensembles that disagree.

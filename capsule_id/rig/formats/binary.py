@@ -7,7 +7,6 @@ import os
 import struct
 import subprocess
 import sys
-import threading
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -17,7 +16,6 @@ from functools import lru_cache
 from importlib import import_module
 from math import prod
 from pathlib import Path
-from subprocess import DEVNULL, PIPE
 from typing import Any
 
 import numpy as np
@@ -99,34 +97,31 @@ def _data_sets(content: bytes, path: Path) -> Named:
     paths = os.pathsep.join(dict.fromkeys([*filter(None, sys.path), own]))
     threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # the memory of their stacks counts
     surroundings = {**os.environ, **threads, "PYTHONPATH": paths}
-    # In a session of its own Ctrl-C reaches this process alone.
-    with subprocess.Popen(
-        command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, env=surroundings, start_new_session=True
-    ) as process:
-        assert process.stdin is not None
-        assert isinstance(process.stdout, io.BufferedReader)
-        watch = threading.Timer(_longest(content), process.kill)
-        watch.start()
-        try:
-            with suppress(OSError):  # the process has ended
-                process.stdin.write(content)
-                process.stdin.close()
-            while (line := process.stdout.readline()).endswith(b"\n"):
-                name, dtype, shape, unit, fault = json.loads(line)
-                if fault is not None:
-                    rule, value, remedy = fault
-                    raise InputError(rule, value, remedy, path)
-                if name is None:
-                    return
-                refuse_large(READING * prod(shape), content, path)
-                array = np.empty(shape, dtype)
-                if process.stdout.readinto(array.data.cast("B")) != array.nbytes:
-                    break
-                yield name, array, unit
-            raise ValueError(f"reading it takes more than {_longest(content)} s, or ends the HDF5 library")
-        finally:
-            watch.cancel()
-            process.kill()
+    out = io.BytesIO()
+    with suppress(subprocess.TimeoutExpired):  # in a session of its own Ctrl-C reaches this process alone
+        done = subprocess.run(
+            command,
+            input=content,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=surroundings,
+            start_new_session=True,
+            timeout=_longest(content),
+            check=False,
+        )
+        out = io.BytesIO(done.stdout)
+    while (line := out.readline()).endswith(b"\n"):
+        name, dtype, shape, unit, fault = json.loads(line)
+        if fault is not None:
+            rule, value, remedy = fault
+            raise InputError(rule, value, remedy, path)
+        if name is None:
+            return
+        values = out.read(size := np.dtype(dtype).itemsize * prod(shape))
+        if len(values) != size:
+            break
+        yield name, np.frombuffer(values, dtype).reshape(shape), unit
+    raise ValueError(f"reading it takes more than {_longest(content)} s, or ends the HDF5 library")
 
 
 def _longest(content: bytes) -> int:

@@ -3,10 +3,10 @@
 import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +71,16 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     first, row = len(head) - 1, head.pop()
     delimiter = delimiter_of(row, layout)
     _refuse_ambiguous_comma(file, first, delimiter, layout)
-    _refuse_separator_in_quotes(file, first, row, delimiter)
+    for cell, position in cells_of(row, delimiter):
+        if cell.count('"') % 2:  # rows such as "10,2","1,5": the separator would cut quoted numbers in two
+            raise InputError(
+                "a cell in quotation marks must not hold the separator of the cells",
+                shown_cell(row.strip()),
+                "export with a decimal point, or with semicolons between the cells",
+                file.path,
+                first + 1,
+                position,
+            )
     *cells, last = texts_of(row, delimiter)
     blank = bool(cells) and not last
     trailing = blank and all(not texts_of(line, delimiter)[-1] for line in file.lines(first) if is_row(line))
@@ -233,20 +242,6 @@ def delimiter_of(line: str, layout: Layout) -> str | None:
     return None if len(words) > 1 and all(_is_reading(word, layout) for word in words) else ","
 
 
-def _refuse_separator_in_quotes(file: TextFile, first: int, row: str, delimiter: str | None) -> None:
-    """Refuse rows such as ``"10,2","1,5"``: the separator would cut quoted numbers in two."""
-    for cell, position in cells_of(row, delimiter):
-        if cell.count('"') % 2:
-            raise InputError(
-                "a cell in quotation marks must not hold the separator of the cells",
-                shown_cell(row.strip()),
-                "export with a decimal point, or with semicolons between the cells",
-                file.path,
-                first + 1,
-                position,
-            )
-
-
 def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, layout: Layout) -> None:
     """Refuse rows such as ``1,25``: two whole numbers, or one number with a decimal comma.
 
@@ -300,83 +295,12 @@ _REMEDY = "export the record again"
 
 @dataclass(frozen=True)
 class _Segment:
-    """One segment: cells of its header by key, names of the columns, 0-based lines of its rows, and their cells."""
+    """One segment: cells of its header by key, names of the columns, 0-based lines of its first row and behind its last."""
 
     keys: dict[str, list[str]]
     names: tuple[str, ...]
-    lines: list[int]
-    rows: list[list[str]]
-
-
-@dataclass(frozen=True)
-class _File:
-    """A file taken apart; ``times_computed``: its rows hold no times."""
-
-    path: Path
-    lines: list[str]
-    separator: str
-    decimal: str | None
-    missing: tuple[str, ...]
-    times_computed: bool
-    segments: list[_Segment]
-
-    def stored(self, column: int) -> np.ndarray:
-        """The numbers of a column; blank cells at the end of a segment are no readings."""
-        parts = []
-        for segment in self.segments:
-            texts = [row[column].strip(BLANKS + '"') if column < len(row) else "" for row in segment.rows]
-            while len(texts) > 1 and not texts[-1]:
-                texts.pop()
-
-            def place(k: int, numbers: list[int] = segment.lines) -> Place:
-                line = self.lines[numbers[k]]
-                return self.path, numbers[k] + 1, place_of_cell(line, self.separator, column, len(line) + 1)
-
-            parts.append(read_column(texts, self.decimal, self.missing, place))
-        return np.concatenate(parts)
-
-    def clocks(self, channel: int) -> list[tuple[float, float]]:
-        """First time and step of a channel, counted from 1, in every segment.
-
-        Raises
-        ------
-        InputError
-            If a header states none.
-        """
-        found = []
-        for segment in self.segments:
-            cells = [([*segment.keys.get(key, []), *[""] * channel])[channel - 1] for key in ("X0", "Delta_X")]
-            start, step = (number_in(cell, self.decimal or ".") for cell in cells)
-            if start is None or step is None or not np.isfinite([start, step]).all() or step <= 0.0:
-                raise InputError(
-                    "a file without times must state X0 and a positive Delta_X for every channel",
-                    shown_cell(" ".join(cells)),
-                    _REMEDY,
-                    self.path,
-                    segment.lines[0] + 1,
-                    1,
-                )
-            found.append((start, step))
-        return found
-
-    def computed(self, channel: int, sizes: Sequence[int]) -> np.ndarray:
-        """The times of a channel, counted from 1; ``sizes`` are the rows of the segments."""
-        pairs = zip(self.clocks(channel), sizes, strict=True)
-        return np.concatenate([start + step * np.arange(size) for (start, step), size in pairs])
-
-    def sources(self) -> list[int]:
-        """For every column that is returned, the column of the file, or -k for the computed times of channel k."""
-        names = self.segments[0].names
-        channels = range(1, len(names))
-        if not self.times_computed:
-            return list(range(len(names)))
-        alike = len({tuple(self.clocks(channel)) for channel in channels}) == 1
-        return [-1, *channels] if alike else [source for channel in channels for source in (-channel, channel)]
-
-    @property
-    def headers(self) -> tuple[str, ...]:
-        """The header of every column that is returned."""
-        return tuple(_TIMES if source < 0 else self.segments[0].names[source] for source in self.sources())
+    first: int
+    stop: int
 
 
 def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
@@ -398,55 +322,98 @@ def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
     """
     refuse_line(layout, path)
     text = TextFile(content, path)
-    if (plain := _one_plain_segment(text, path, layout)) is not None:
-        file, rows = plain
-        lines, sizes, stored = rows.lines, [len(rows.lines)], rows.column
-    else:
-        file = _take_apart([*text.lines(), ""], path, layout.missing)
-        sizes, stored = [len(segment.lines) for segment in file.segments], file.stored
-        lines = np.array([line for segment in file.segments for line in segment.lines]) + 1
-    sources = file.sources()
+    separator, head, segments = _take_apart(text)
+    names, (stated, computed) = (
+        segments[0].names,
+        ([*head.get(key, []), ""][0] for key in ("Decimal_Separator", "X_Columns")),
+    )
+    decimal = stated if stated in (".", ",") else None
+    sources, clocks = list(range(len(names))), dict[int, list[tuple[float, float]]]()
+    if computed.lower() == "no":  # -k: the computed times of channel k
+        clocks = {-k: [_clock(segment, k, decimal, path) for segment in segments] for k in sources[1:]}
+        alike = all(clock == clocks[-1] for clock in clocks.values())
+        sources = [-1, *sources[1:]] if alike else [source for k in sources[1:] for source in (-k, k)]
+    headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
+    wanted = [k for k, _ in enumerate(sources) if layout.columns is None or is_wanted(k, (headers,), layout.columns)]
+    rows = _plain(text, segments, separator, decimal, sorted({sources[k] for k in wanted if sources[k] >= 0}))
+    stored = rows.column if rows else _by_cells(text, segments, separator, decimal, layout.missing)
+    lines = np.concatenate([np.arange(segment.first, segment.stop) for segment in segments]) + 1
 
     def values(column: int) -> np.ndarray:
-        source = sources[column]
-        return stored(source) if source >= 0 else file.computed(-source, sizes)
+        if (source := sources[column]) >= 0:
+            return stored(source)
+        pairs = zip(clocks[source], segments, strict=True)
+        return np.concatenate([start + step * np.arange(part.stop - part.first) for (start, step), part in pairs])
 
     def place(row: int | None, column: int) -> Place:
         line = text.line(number := int(lines[0] - 2 if row is None else lines[row] - 1))
-        return path, number + 1, place_of_cell(line, file.separator, max(sources[column], 0), len(line) + 1)
+        return path, number + 1, place_of_cell(line, separator, max(sources[column], 0), len(line) + 1)
 
-    return Export(path, (file.headers,), len(sources), lines, values, place, text.encoding)
-
-
-def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> "tuple[_File, Rows] | None":
-    """A file with one segment of numbers alone, read in blocks, with its wanted columns; None for any other file."""
-    head: list[str] = []
-    ends = 0
-    for line in islice(text.lines(), MOST_TITLES):
-        head.append(line)
-        ends += line.startswith(_END)
-        if ends == 2 and len(head) > 2 and head[-3].startswith(_END):
-            break
-    try:
-        file = _take_apart([*head, ""], path, layout.missing)
-        sources = file.sources()
-    except InputError:
-        return None
-    segment, names = file.segments[0], (file.headers,)
-    chosen = [
-        source for k, source in enumerate(sources) if layout.columns is None or is_wanted(k, names, layout.columns)
-    ]
-    width = len(segment.names)
-    trailing = len(segment.rows[0]) == width + 1 and not segment.rows[0][-1].strip()
-    decimal = file.decimal or ("," if "," in head[segment.lines[0]] and file.separator != "," else ".")
-    shape = Shape(segment.lines[0], file.separator, width, decimal, trailing)
-    rows = plain_table(text, shape, sorted({source for source in chosen if source >= 0}))
-    return None if rows is None else (file, rows)
+    return Export(path, (headers,), len(sources), lines, values, place, text.encoding)
 
 
-def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File:
-    """Headers and segments of a file."""
-    if not any(line.strip().startswith(_END) for line in lines):
+def _clock(segment: _Segment, channel: int, decimal: str | None, path: Path) -> tuple[float, float]:
+    """First time and step of a channel, counted from 1.
+
+    Raises
+    ------
+    InputError
+        If the header of the segment states none.
+    """
+    cells = [([*segment.keys.get(key, []), *[""] * channel])[channel - 1] for key in ("X0", "Delta_X")]
+    start, step = (number_in(cell, decimal or ".") for cell in cells)
+    if start is None or step is None or not np.isfinite([start, step]).all() or step <= 0.0:
+        raise InputError(
+            "a file without times must state X0 and a positive Delta_X for every channel",
+            shown_cell(" ".join(cells)),
+            _REMEDY,
+            path,
+            segment.first + 1,
+            1,
+        )
+    return start, step
+
+
+def _plain(
+    text: TextFile, segments: Sequence[_Segment], separator: str, decimal: str | None, columns: Sequence[int]
+) -> Rows | None:
+    """The rows of a file with one segment of numbers alone, read in blocks; None for any other file."""
+    segment, width = segments[0], len(segments[0].names)
+    row = text.line(segment.first)
+    *_, last = cells = row.split(separator)
+    mark = decimal or ("," if "," in row and separator != "," else ".")
+    shape = Shape(segment.first, separator, width, mark, trailing=len(cells) == width + 1 and not last.strip())
+    return plain_table(text, shape, columns) if len(segments) == 1 else None
+
+
+def _by_cells(
+    text: TextFile, segments: Sequence[_Segment], separator: str, decimal: str | None, missing: Sequence[str]
+) -> Callable[[int], np.ndarray]:
+    """The numbers of a column of the file; blank cells at the end of a segment are no readings."""
+    lines = [*text.lines()]
+    tables = [[line.split(separator) for line in lines[segment.first : segment.stop]] for segment in segments]
+
+    def column(index: int) -> np.ndarray:
+        parts = []
+        for segment, rows in zip(segments, tables, strict=True):
+            texts = [row[index].strip(BLANKS + '"') if index < len(row) else "" for row in rows]
+            while len(texts) > 1 and not texts[-1]:
+                texts.pop()
+
+            def place(k: int, first: int = segment.first) -> Place:
+                line = lines[first + k]
+                return text.path, first + k + 1, place_of_cell(line, separator, index, len(line) + 1)
+
+            parts.append(read_column(texts, decimal, missing, place))
+        return np.concatenate(parts)
+
+    return column
+
+
+def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segment]]:
+    """Separator, cells of the file's header by key, and segments; special blocks between them are skipped."""
+    path, segments = text.path, list[_Segment]()
+    if not any(line.strip().startswith(_END) for line in text.lines()):
         raise InputError(
             f"a .lvm file must have a header that ends with {_END}",
             "none",
@@ -455,59 +422,41 @@ def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File
             1,
             1,
         )
-    word = "Separator"
-    stated = next((line for line in lines if line.startswith(word)), word + "\t")
-    separator = "," if stated[len(word) :].startswith(",") else "\t"
-    head, position = _header(lines, 0, separator, path)
-    segments: list[_Segment] = []
-    while (start := _next_header(lines, position, separator)) is not None:
-        keys, first = _header(lines, start, separator, path)
-        segment, position = _segment(lines, first, separator, keys)
-        if not segment.lines:
-            raise InputError("a segment must have rows", "none", _REMEDY, path, min(first + 1, len(lines)), 1)
-        if segments and segment.names != segments[0].names:
-            raise InputError(
-                "segments must have the same columns", shown_cell(" ".join(segment.names)), _REMEDY, path, first + 1, 1
-            )
-        segments.append(segment)
+    stated = next((line for line in text.lines() if line.startswith("Separator")), "")
+    separator = "," if stated.startswith("Separator,") else "\t"
+    head: dict[str, list[str]] | None = None
+    keys, names, state, first, special, number = dict[str, list[str]](), [""], "header", 0, False, 0
+    for number, line in enumerate(chain(text.lines(), ["", ""])):
+        if state == "rows":
+            if line.strip() and not line.startswith(("***", "Channels")):
+                continue
+            if number == first:
+                raise InputError("a segment must have rows", "none", _REMEDY, path, first, 1)
+            segments.append(_Segment(keys, tuple(names), first, number))
+            if names != [*segments[0].names]:
+                rule = "segments must have the same columns"
+                raise InputError(rule, shown_cell(" ".join(names)), _REMEDY, path, first, 1)
+            state = "between"
+        key, *cells = (cell.strip() for cell in line.split(separator))
+        if state == "names":
+            names = [" ".join(name.split()) for name in (key, *cells)]
+            while names and names[-1] in ("", _COMMENT):
+                names.pop()
+            state, first = "rows", number + 1
+            continue
+        if state == "between":
+            special = (special or key == _SPECIAL) and key != _END_SPECIAL
+            if special or key in ("", _END_SPECIAL):
+                continue
+            keys, state = {}, "header"
+        if key != _END:
+            keys[key] = cells
+        else:
+            head, state = (keys, "between") if head is None else (head, "names")
+    if head is None or state == "header":
+        raise InputError(f"a header must end with {_END}", "the end of the file", _REMEDY, path, number, 1)
     if not segments:
-        raise InputError("a LabVIEW measurement file must have a segment", "none", _REMEDY, path, len(lines), 1)
+        raise InputError("a LabVIEW measurement file must have a segment", "none", _REMEDY, path, number, 1)
     if len(segments[0].names) < 2:
-        raise InputError("a segment must have channels", "none", _REMEDY, path, segments[0].lines[0], 1)
-    decimal = (head.get("Decimal_Separator") or [""])[0]
-    computed = (head.get("X_Columns") or [""])[0].lower() == "no"
-    return _File(path, lines, separator, decimal if decimal in (".", ",") else None, missing, computed, segments)
-
-
-def _next_header(lines: list[str], position: int, separator: str) -> int | None:
-    """The first line of the next header, None at the end of the file; special blocks are skipped."""
-    special = False
-    for number in range(position, len(lines)):
-        word = lines[number].split(separator)[0].strip()
-        special = (special or word == _SPECIAL) and word != _END_SPECIAL
-        if not special and word and word != _END_SPECIAL:
-            return number
-    return None
-
-
-def _header(lines: list[str], position: int, separator: str, path: Path) -> tuple[dict[str, list[str]], int]:
-    """The cells behind each key of a header, and the line after it."""
-    keys: dict[str, list[str]] = {}
-    for number in range(position, len(lines)):
-        key, *cells = (cell.strip() for cell in lines[number].split(separator))
-        if key == _END:
-            return keys, number + 1
-        keys[key] = cells
-    raise InputError(f"a header must end with {_END}", "the end of the file", _REMEDY, path, len(lines), 1)
-
-
-def _segment(lines: list[str], position: int, separator: str, keys: dict[str, list[str]]) -> tuple[_Segment, int]:
-    """The columns and rows of a segment, and the line after it."""
-    names = [" ".join(name.split()) for name in lines[position].split(separator)] if position < len(lines) else []
-    while names and names[-1] in ("", _COMMENT):
-        names.pop()
-    stop = position + 1
-    while stop < len(lines) and lines[stop].strip() and not lines[stop].startswith(("***", "Channels")):
-        stop += 1
-    numbers = list(range(position + 1, stop))
-    return _Segment(keys, tuple(names), numbers, [lines[number].split(separator) for number in numbers]), stop
+        raise InputError("a segment must have channels", "none", _REMEDY, path, segments[0].first, 1)
+    return separator, head, segments

@@ -155,10 +155,6 @@ class TextFile:
             else raw.decode(_CODECS[self.encoding]).encode()
         )
         self._text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
-        self._refuse_long_line()
-
-    def _refuse_long_line(self) -> None:
-        """Refuse a line longer than ``LONGEST_LINE``, at its place."""
         begin = 0
         while begin + LONGEST_LINE < len(self._text):
             end = self._text.rfind(b"\n", begin, begin + LONGEST_LINE + 1) + 1

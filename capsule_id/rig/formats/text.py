@@ -427,7 +427,18 @@ def read_csv(content: Content, path: Path) -> RawTable:
     file = TextFile(content, path)
     header = file.line(0)
     if not header.strip():
-        _refuse_blank(file)
+        first = (
+            "lines between the first and the last must not be blank",
+            "a blank line",
+            "put the header on the first line",
+        )
+        if not any(line.strip() for line in file.lines()):
+            first = (
+                "a table must not be empty",
+                "no text at all",
+                "write a header `name [unit]` per column and one row per reading",
+            )
+        raise InputError(*first, path, 1, 1)
     delimiter = next((mark for mark in "\t;," if mark in header), ",")
     refuse_wide(header.count(delimiter) + 1, path, 1)
     names, units = _header(header, delimiter, path)
@@ -442,27 +453,6 @@ def read_csv(content: Content, path: Path) -> RawTable:
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
     return RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
-
-
-def _refuse_blank(file: TextFile) -> None:
-    """Raise where the first line is blank."""
-    if not any(line.strip() for line in file.lines()):
-        raise InputError(
-            "a table must not be empty",
-            "no text at all",
-            "write a header `name [unit]` per column and one row per reading",
-            file.path,
-            1,
-            1,
-        )
-    raise InputError(
-        "lines between the first and the last must not be blank",
-        "a blank line",
-        "put the header on the first line",
-        file.path,
-        1,
-        1,
-    )
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
