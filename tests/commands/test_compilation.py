@@ -97,3 +97,19 @@ def test_the_users_own_cache_is_left_alone(variables: dict[str, str], tmp_path: 
     damaged = f"{compilation.CACHE_ERRORS[0]} for 'x': ValueError: x"
     assert compilation.leave_cache(damaged) == damaged
     assert own.exists()
+
+
+def test_kinds_of_experiments_leave_the_options_of_xla_open(tmp_path: Path) -> None:
+    """They import JAX before a command sets its options: these act until JAX computes, and the cache is in use then."""
+    before = (
+        "import sys\nfrom capsule_id.experiments.kind import default_registry\ndefault_registry()\n"
+        "from capsule_id.commands import compilation\n"
+        "compilation.prepare_jax(cached=True)\nimport jax, os\n"
+        "used = jax.config.jax_compilation_cache_dir\n"
+        "assert used == os.environ[compilation.DIRECTORY] == str(compilation.cache_directory())\n"
+        "assert compilation.XLA_LOOP_OPTION in os.environ['XLA_FLAGS']\n"
+        "assert jax.config.jax_persistent_cache_min_compile_time_secs == 0.3\n"
+    )
+    own = dict.fromkeys((name for name in os.environ if name.startswith(("JAX_", "XLA_"))), None)
+    done = run("--version", cwd=tmp_path, before=before, env=environment(**own, XDG_CACHE_HOME=str(tmp_path / "cache")))
+    assert done.returncode == 0, done.stderr

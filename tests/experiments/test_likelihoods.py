@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.base import BLOCKS, Experiment, ValuesBySymbol
+from capsule_id.experiments import base, make_experiments
+from capsule_id.experiments.base import BLOCKS, MOST_TERMS, Experiment, ValuesBySymbol
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.rig.model import Table
 from tests.scipy_decay import scipy_decay
@@ -276,6 +276,14 @@ class TestLeftOut:
         whole = experiment.misfit(self.THETA).left_out(np.array([0]))
         assert whole[0] == pytest.approx(float(experiment.log_likelihood(self.THETA, np)), rel=1e-9)
         assert rows.shape == (experiment.n,)
+
+    def test_a_long_table_has_stretches_of_rows(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        experiment = record(UNIFORM)
+        monkeypatch.setattr(type(experiment), "time_series", False)
+        assert len(experiment.blocks) == min(experiment.n, MOST_TERMS)
+        monkeypatch.setattr(base, "MOST_TERMS", 7)
+        assert len(experiment.blocks) == 7
+        assert np.max(np.diff(experiment.blocks)) <= -(-experiment.n // 7)
 
     def test_replicates_scatter_by_the_noise(self) -> None:
         experiment = record(UNIFORM)

@@ -7,6 +7,7 @@ import pytest
 from scipy import signal
 
 from capsule_id.experiments.free_vibration.models import decay as rubbed
+from capsule_id.records import release
 from capsule_id.records.release import FreeDecay, find_free_decay
 from tests.experiments.bench import K1, M1, released
 from tests.records.test_fault_detectors import PERIOD, RATE, TIME, decay, encoder
@@ -191,3 +192,20 @@ def test_a_record_from_behind_the_release_on_keeps_its_samples(number: int) -> N
             found = find_free_decay(true.time, true.values)
             lost += found is not None and found.start > true.time[0] + 2.001 * true.step
     assert lost <= 2 * number // 4
+
+
+@pytest.mark.parametrize("held", [0, 3])
+def test_no_release_is_looked_for_in_a_viscous_decay(held: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One decay from the first sample on needs no search; with three samples held before it the search finds them."""
+    searched = []
+    search = release._release
+    monkeypatch.setattr(release, "_release", lambda *given: searched.append(given) or search(*given))
+    time = 0.01 * np.arange(400)
+    motion = np.maximum(time - held * 0.01, 0.0)
+    values = np.exp(-0.3 * motion) * np.cos(2.0 * np.pi * 2.0 * motion)
+    values += 0.004 * np.random.default_rng(held).standard_normal(400)
+    found = find_free_decay(time, values, displacement=True)
+    assert found is not None
+    assert bool(searched) == (held > 0)
+    assert abs(found.start - held * 0.01) <= 0.021
+    assert found.period == pytest.approx(0.5, rel=0.02)
