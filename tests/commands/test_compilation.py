@@ -29,9 +29,13 @@ def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("XLA_FLAGS", "")
     compilation.prepare_jax(cached=False, loop=False)
     assert compilation.os.environ["XLA_FLAGS"] == emitter
-    monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules={"jax": None}))
-    compilation.prepare_jax(cached=False)
-    assert compilation.os.environ["XLA_FLAGS"] == emitter
+    # JAX that has computed something has read its options; JAX that is only imported has not.
+    for computed, after in ((True, emitter), (False, f"{emitter} {loop}")):
+        bridge = SimpleNamespace(backends_are_initialized=lambda computed=computed: computed)
+        modules = {"jax": None, "jax._src.xla_bridge": bridge}
+        monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules=modules))
+        compilation.prepare_jax(cached=False)
+        assert compilation.os.environ["XLA_FLAGS"].split() == after.split()
 
 
 def test_blas_takes_one_thread(tmp_path: Path) -> None:
