@@ -1,5 +1,6 @@
 """Joint fit of all experiments: its starts, its second fits, and the stage of the pipeline that runs it."""
 
+import threading
 import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,8 @@ from capsule_id.views import counted
 # For runs alone, the estimates of the paper's protocol replace those of the bench. Log-posteriors come in batches.
 
 
+#: Filters of warnings belong to the process: one thread at a time changes them.
+_FILTERS = threading.Lock()
 #: Number of starting points that are always tried (the bench estimate included), and the largest number.
 STARTS, MAX_STARTS = 3, 8
 #: Number of candidates.
@@ -343,7 +346,7 @@ def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
     modes: dict[int, float] = {}
     for members, density in _scatter_densities(target, u):
         # The line search may try sizes that have no finite density, and rounding may end it at the maximum.
-        with warnings.catch_warnings(), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        with _FILTERS, warnings.catch_warnings(), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
             found = minimize(lambda t, density=density: -density(t), u[members], method="BFGS").x
         modes |= dict(zip(members.tolist(), found.tolist(), strict=True))
