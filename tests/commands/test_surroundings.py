@@ -6,6 +6,7 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from capsule_id import load
@@ -75,14 +76,16 @@ def test_a_fit_ends_with_its_result(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["no such backend", "everything"])
 def test_figures_are_the_same_in_all_surroundings(tmp_path: Path, name: str) -> None:
     """The style and the backend are those of the package; a sample too is drawn and read back."""
-    pictures = []
+    pictures, draws = [], []
     for surroundings in ("no home", name):
         (tmp_path / surroundings).mkdir()
         assert fitted(tmp_path / surroundings, surroundings).returncode == 0
         folder = tmp_path / surroundings / f"{SURROUNDINGS[surroundings][2]}.out"
         pictures.append({path.name: path.read_bytes() for path in (folder / "figures").glob("*.png")})
-        assert load(folder).posterior is not None
+        draws.append(load(folder).posterior.draws)
+    assert pictures[0]
     assert pictures[0] == pictures[1]
+    np.testing.assert_array_equal(*draws)
 
 
 @pytest.mark.full

@@ -204,8 +204,7 @@ def test_no_release_is_looked_for_in_a_viscous_decay(held: int, monkeypatch: pyt
     motion = np.maximum(time - held * 0.01, 0.0)
     values = np.exp(-0.3 * motion) * np.cos(2.0 * np.pi * 2.0 * motion)
     values += 0.004 * np.random.default_rng(held).standard_normal(400)
-    found = find_free_decay(time, values, displacement=True)
-    assert found is not None
+    found = cast(FreeDecay, find_free_decay(time, values, displacement=True))
     assert bool(searched) == (held > 0)
     assert abs(found.start - held * 0.01) <= 0.021
     assert found.period == pytest.approx(0.5, rel=0.02)

@@ -11,6 +11,7 @@ This module loads no JAX: the commands set its options after they have read a ri
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -383,5 +384,11 @@ def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:
     frequency = frequency_of(time, values)
     if frequency * float(time[-1] - time[0]) > FEW_PERIODS or np.ptp(values) == 0.0:
         return frequency
-    found = viscous_fit(*shortened(time, values))
+    found = _fit_of(*(np.asarray(part, float).tobytes() for part in shortened(time, values)))
     return found.omega / (2.0 * np.pi) if found.ratio > PEAKLESS else frequency
+
+
+@lru_cache(maxsize=8)
+def _fit_of(time: bytes, values: bytes) -> ViscousFit:
+    """``viscous_fit`` of bytes of float64: several checks of a record ask for its frequency."""
+    return viscous_fit(np.frombuffer(time), np.frombuffer(values))
