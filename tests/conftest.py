@@ -17,14 +17,13 @@ import pytest
 from jaxtyping import install_import_hook
 
 from capsule_id.commands.compilation import XLA_EMITTER_OPTION
-from capsule_id.precision import HAS_EMITTER_OPTION
 from tests.capsule_cases import Cases, read_cases
 
 #: Programs that take longer than this to compile, s, are kept.
 WORTH_KEEPING = "0.3"
 
 #: A program in one part costs a tenth less CPU time to compile than one that is compiled by several threads.
-XLA_ONE_PART = "--xla_cpu_parallel_codegen_split_count=1" if HAS_EMITTER_OPTION else ""
+XLA_ONE_PART = "--xla_cpu_parallel_codegen_split_count=1"
 
 #: Files that take longest, first: the workers then end at the same time.
 FIRST = ("test_project.py", "test_notebooks.py", "test_notebooks_even.py", "test_foreign_law.py", "test_smooth.py")
@@ -89,7 +88,7 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # As the commands do; benchmarks time the options that their caller sets.
     if config.getoption("markexpr") != "benchmark":
-        os.environ.setdefault("XLA_FLAGS", f"{XLA_EMITTER_OPTION} {XLA_ONE_PART}".strip())
+        os.environ.setdefault("XLA_FLAGS", f"{XLA_EMITTER_OPTION} {XLA_ONE_PART}")
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     folder = tempfile.mkdtemp(prefix="capsule-id-compiled-")

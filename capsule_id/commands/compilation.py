@@ -16,12 +16,10 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from capsule_id.precision import HAS_EMITTER_OPTION
-
 # XLA then compiles each loop of an engine as one function: fits and batches are faster. CPU only.
 XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 # Without XLA's newer emitters of fused loops a program compiles in half the time, and runs no slower. CPU only.
-XLA_EMITTER_OPTION = "--xla_cpu_use_fusion_emitters=false" if HAS_EMITTER_OPTION else ""
+XLA_EMITTER_OPTION = "--xla_cpu_use_fusion_emitters=false"
 #: Variable with the number of threads of OpenBLAS, which NumPy and SciPy bring.
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 #: Variables of JAX, unless the user has set them: largest size of the cache, bytes, beyond which it removes the programs that

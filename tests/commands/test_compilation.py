@@ -24,7 +24,6 @@ def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
     ):
         monkeypatch.setenv("XLA_FLAGS", before)
         compilation.prepare_jax(cached=False)
-        # jaxlib 0.11 and later have no emitter option: its place is empty then.
         assert compilation.os.environ["XLA_FLAGS"].split() == after.split()
     monkeypatch.setenv("XLA_FLAGS", "")
     compilation.prepare_jax(cached=False, loop=False)

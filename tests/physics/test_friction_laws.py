@@ -111,6 +111,13 @@ def test_another_law_against_scipy(law: TwoWay) -> None:
     assert_both_ways_as_scipy(t, expected, contacts)
 
 
+def test_laws_with_as_many_numbers_are_different_pytrees() -> None:
+    """Else JAX may run the compiled program of another law: jaxlib 0.10 holds dataclasses of as many fields for equal."""
+    eq_1 = CoulombStribeck(0.5, NORMAL_FORCE, 0.1, 0.5)
+    assert len(jax.tree.leaves(eq_1)) == len(jax.tree.leaves(LORENTZIAN))
+    assert jax.tree.structure(eq_1) != jax.tree.structure(LORENTZIAN)
+
+
 def test_eq_1_without_its_own_recursion_is_the_same_motion(cases: Cases) -> None:
     fast, slow = (simulate(cases.p, cases.e, cases.times, friction=law) for law in (None, as_a_user_writes_it(cases.p)))
     np.testing.assert_allclose(states_of(slow)[..., [0, 2]], states_of(fast)[..., [0, 2]], rtol=0.0, atol=1e-11)
