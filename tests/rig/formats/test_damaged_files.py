@@ -1,4 +1,4 @@
-"""Damaged and hostile files end in one clean error line. The files with numbers were found by ``fuzz_readers.py``."""
+"""Damaged and hostile files end in one clean error line. The files with numbers were found by a coverage-guided fuzzer."""
 
 import gzip
 import io
