@@ -12,6 +12,7 @@ import pandas as pd
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, Registry, default_registry
+from capsule_id.output import replace_files
 from capsule_id.parameters import TABLE, TABLE_1
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
@@ -115,13 +116,11 @@ def _check_new(folder: Path) -> None:
 
 
 def _write(folder: Path, tables: Mapping[str, Mapping[str, Any]], rig: str, known: Mapping[str, Any]) -> None:
-    """Write tables by file name, the text of ``rig.toml`` and, beside the folder, what is known."""
+    """Write tables by file name, the text of ``rig.toml`` and, beside the folder, what is known; on a full disk nothing."""
     folder.mkdir(parents=True, exist_ok=True)
-    for file, columns in tables.items():
-        rows = pd.DataFrame(columns)
-        rows.to_csv(folder / file, index=False, float_format="%.9g", na_rep="nan", lineterminator="\n")
-    (folder / "rig.toml").write_text(rig, encoding="utf-8", newline="\n")
-    _truth_file(folder).write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")
+    form = {"index": False, "float_format": "%.9g", "na_rep": "nan", "lineterminator": "\n"}
+    contents = {folder / file: pd.DataFrame(columns).to_csv(**form) for file, columns in tables.items()}
+    replace_files({**contents, folder / "rig.toml": rig, _truth_file(folder): json.dumps(known, indent=1) + "\n"})
 
 
 def truth_beside(rig: Rig) -> dict[str, float]:

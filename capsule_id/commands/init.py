@@ -9,6 +9,7 @@ from capsule_id.console import say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.importing import entry_of, read_file
+from capsule_id.output import replace_files
 from capsule_id.rig.toml import NAME_PATTERN
 
 # Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
@@ -112,14 +113,8 @@ def run(args: argparse.Namespace) -> int:
         usable = re.fullmatch(NAME_PATTERN, name) and name.strip(".")
         text = template(kinds, name if usable else "rig", [entry for entry, _ in guesses.values()])
         contents = {"rig.toml": text.encode(), **contents}
-        made = [file for file in contents if (folder / file).resolve() not in own]
-        try:
-            for file in made:
-                (folder / file).write_bytes(contents[file])
-        except OSError:  # a part of a table would be read as a table
-            for file in made:
-                (folder / file).unlink(missing_ok=True)
-            raise
+        # A part of a table would be read as a table.
+        replace_files({folder / file: text for file, text in contents.items() if (folder / file).resolve() not in own})
     if not files:
         say(
             f"wrote {folder / 'rig.toml'}: add tables, remove the `# ` of their entries, then run capsule-id check {folder}"

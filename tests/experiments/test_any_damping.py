@@ -1,6 +1,7 @@
 """Viscous decays of any damping: the search for them, what is refused, and models that contain others."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -143,22 +144,42 @@ def test_a_strongly_damped_decay_is_fitted(tmp_path: Path, ratio: float) -> None
     assert np.isnan(result.summary.loc["k1", "paper"])
 
 
+def asked(path: Path) -> str:
+    """The line of ``[prior]`` for which a check of the rig folder asks, "" where it asks for none."""
+    rig, kinds = cid.read_rig(path), default_registry()
+    others = [found.facts["other"] for found in lint(rig, kinds, rig.tables) if found.code == "decays.sampling"]
+    return next((found[0] for other in others if (found := re.search("k1 = {.*}", other))), "")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.3, 0.6, 0.9, 1.0, 1.5])
 def test_decays_of_any_damping_are_covered(tmp_path: Path, ratio: float) -> None:
-    """20 twins, sampled: at most 2 are not trusted, and of the others 95 % intervals of k1 and c hold the truth in 17."""
-    inside, untrusted = {"k1": 0, "c": 0}, 0
+    """20 twins, sampled: at most 2 are not trusted, and of the others 95 % intervals of k1 and c hold the truth in 17.
+
+    Where even samples have an alias inside the default prior of k1, the line for which the check asks is stated.
+    """
+    inside, untrusted, lines = {"k1": 0, "c": 0}, 0, 0
     for seed in range(20):
         time, x, k1, c, m1 = twin(ratio, seed)
-        summary = cid.fit(cid.read_rig(folder(tmp_path / str(seed), time, x, m1)), seed=seed).summary
-        trusted = summary.loc["k1", "trust"] == summary.loc["c", "trust"] == "trusted"
-        untrusted += not trusted
-        for name, truth in (("k1", k1), ("c", c)):
-            row = summary.loc[name]
-            inside[name] += not trusted or bool(row["lower"] <= truth <= row["upper"])
-    print(ratio, inside, untrusted)
+        path = folder(tmp_path / str(seed), time, x, m1)
+        if line := asked(path):
+            lines += 1
+            with (path / "rig.toml").open("a") as file:
+                file.write(f"[prior]\n{line}\n")
+        try:
+            rows = cid.fit(cid.read_rig(path), seed=seed).summary.loc[["k1", "c"]]
+        except InputError:  # 1 of 300 seems to be held by dry friction
+            untrusted += 1
+            continue
+        if set(rows["trust"]) != {"trusted"}:
+            untrusted += 1
+            continue
+        for (name, row), truth in zip(rows.iterrows(), (k1, c), strict=True):
+            inside[name] += bool(row["lower"] <= truth <= row["upper"])
+            print(ratio, seed, name, row["lower"], truth, row["upper"])
+    print(ratio, inside, untrusted, lines)
     assert untrusted <= 2
-    assert min(inside.values()) >= 17
+    assert min(inside.values()) >= 17 - untrusted
 
 
 def test_a_richer_model_is_never_worse_than_one_that_it_contains() -> None:

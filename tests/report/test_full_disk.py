@@ -135,7 +135,8 @@ def test_other_outputs_of_commands(tmp_path: Path, capsys: pytest.CaptureFixture
         assert str(tmp_path) in line
         assert "." not in named or (tmp_path / named).read_text() == "old"
     # Nothing is left of the cut files: the same command works when there is space.
-    assert capsule_id(["init", str(tmp_path / "new")]) == 0
+    for words in (["init", "new"], ["synthesize", "rig"], ["synthesize", "robot", "--robot"]):
+        assert capsule_id([words[0], str(tmp_path / words[1]), *words[2:]]) == 0
 
 
 @pytest.mark.full
