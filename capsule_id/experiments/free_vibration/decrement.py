@@ -54,6 +54,8 @@ SMALLEST_SWING = 0.05
 FEWEST_SEARCHED, MOST_SEARCHED, MOST_REFINED = 16, 1000, 20_000
 #: Spectra with fewer periods are checked by a fit; its damping ratio beyond which a spectrum may have no peak.
 FEW_PERIODS, PEAKLESS = 4.0, 0.3
+#: Share of their trace that is added to normal equations, which may be singular.
+SINGULAR = 1e-13
 
 
 def viscous_basis(time: Any, k1: Any, c: Any, m1: Any, xp: ModuleType) -> Any:
@@ -264,27 +266,35 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: 
     wide = np.geomspace(SLOWEST / length, np.pi / step, WIDE_POINTS)
     tried = [*itertools.product(near[near > 0.0], LIGHT_RATIOS), *itertools.product(wide, STRONG_RATIOS)]
 
-    def fitted(z: np.ndarray, part: slice) -> ViscousFit:
-        omega, ratio, share = np.exp([*z, np.inf, np.inf][:3])
-        t = time[part]
+    def motions(z: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """(..., n, 1 or 2) of the unknowns z, (number, ...)."""
+        omega, ratio, share = np.exp([*z, *np.full((3 - unknowns, *z.shape[1:]), np.inf)])[..., None]
         if unknowns == 1:
-            basis = np.exp(-omega * t)
-        elif unknowns == 2:
-            basis = viscous_basis(t, omega**2, 2.0 * ratio * omega, 1.0, np)
-        else:  # backwards in time from the stop, at a share of the half period, damping is negative
-            left = share * np.pi / (omega * np.sqrt(1.0 - ratio**2)) - t
-            basis = viscous_basis(np.maximum(left, 0.0), omega**2, -2.0 * ratio * omega, 1.0, np)
-            basis = (basis[:, :1], basis[:, 1:], basis * (left > 0.0)[:, None])[order]
-        design = np.column_stack([basis, np.ones(len(t))])
+            return np.exp(-omega * t)[..., None]
+        if unknowns == 2:
+            return viscous_basis(t, omega**2, 2.0 * ratio * omega, 1.0, np)
+        # Backwards in time from the stop, at a share of the half period, damping is negative.
+        left = share * np.pi / (omega * np.sqrt(1.0 - ratio**2)) - t
+        basis = viscous_basis(np.maximum(left, 0.0), omega**2, -2.0 * ratio * omega, 1.0, np)
+        return (basis[..., :1], basis[..., 1:], basis * (left > 0.0)[..., None])[order]
+
+    def fitted(z: np.ndarray, part: slice) -> ViscousFit:
+        omega, ratio = np.exp([*z, np.inf][:2])
+        design = np.column_stack([motions(z, time[part]), np.ones(len(time[part]))])
         parts = np.linalg.lstsq(design, values[part])[0]
         return ViscousFit(float(ratio * omega), float(omega**2), parts, values[part] - design @ parts)
 
     few, fine = (slice(0, end, -(-end // most)) for most in (MOST_SEARCHED, MOST_REFINED))
     strongest = LARGEST_SEARCHED if unknowns == 2 else LARGEST_RATIO
-    points = {
-        tuple(np.log([*pair, 0.9])[:unknowns]): None for pair in tried if unknowns == 2 or pair[1] < LARGEST_RATIO
-    }
-    starts = sorted(points, key=lambda z: float(np.sum(fitted(np.array(z), few).left ** 2)))[:REFINED]
+    points = np.log([[*pair, 0.9] for pair in tried if unknowns == 2 or pair[1] < LARGEST_RATIO]).T[:unknowns]
+    points = np.unique(points, axis=1)
+    # The part of each point in the sum of squares about the mean, by the normal equations.
+    moved = motions(points, time[few])
+    moved -= np.mean(moved, axis=1, keepdims=True)
+    square, product = np.swapaxes(moved, 1, 2) @ moved, (values[few] - np.mean(values[few])) @ moved
+    ridge = SINGULAR * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(square.shape[1])
+    taken = np.sum(product * np.linalg.solve(square + ridge, product[..., None])[..., 0], axis=1)
+    starts = points.T[np.argsort(-taken, kind="stable")[:REFINED]]
     low, high = np.log([[0.1 * SLOWEST / length, SMALLEST_RATIO, 0.01], [np.pi / step, strongest, 1.0]])[:, :unknowns]
     ends = [
         least_squares(lambda z: fitted(z, fine).left / size, np.clip(z, low, high), bounds=(low, high), x_scale=0.1)
