@@ -274,3 +274,17 @@ def test_a_step_after_rest_is_no_clipped_record_and_its_rounding_no_wrong_model(
     clipped = folder(tmp_path / "b", time, np.minimum(x, 8.5e-3), m1)
     again = cid.fit(cid.read_rig(clipped), budget=None)
     assert "readings.clipped" in [f.code for f in again.findings if f.level == "fail"]
+
+
+@pytest.mark.parametrize(
+    ("seed", "lost"), [(1, range(90, 110)), pytest.param(3, range(60, 90), marks=pytest.mark.full)]
+)
+def test_a_strongly_damped_decay_has_no_jump(tmp_path: Path, seed: int, lost: range) -> None:
+    """(Before: "it jumps by 0.49 of its amplitude", because the spectrum has its peak at half the frequency.)"""
+    time, x, *_, m1 = twin(0.9, seed)
+    rig, kinds = cid.read_rig(folder(tmp_path / "whole", time, x, m1)), default_registry()
+    assert "readings.jump" not in {found.code for found in lint(rig, kinds, rig.tables)}
+    # Control: samples are lost.
+    kept = np.delete(np.arange(len(x)), lost)
+    rig = cid.read_rig(folder(tmp_path / "lost", time[: len(kept)], x[kept], m1))
+    assert "readings.jump" in {found.code for found in lint(rig, kinds, rig.tables)}
