@@ -53,9 +53,13 @@ if TYPE_CHECKING:
     from capsule_id.errors import InputError as InputError
     from capsule_id.importing import propose_entry as propose_entry
     from capsule_id.inference.compare import compare_models as compare_models, compare_points as compare_points
-    from capsule_id.motions.operating import draws_diagram as draws_diagram
     from capsule_id.motions.response import Response as Response, Settling as Settling, response as response
-    from capsule_id.motions.sweep import continuation as continuation, diagram as diagram, motion_map as motion_map
+    from capsule_id.motions.sweep import (
+        continuation as continuation,
+        diagram as diagram,
+        draws_diagram as draws_diagram,
+        motion_map as motion_map,
+    )
     from capsule_id.physics.drive import Excitation as Excitation
     from capsule_id.physics.drives import Pulses as Pulses, RecordedDrive as RecordedDrive, RodMotion as RodMotion
     from capsule_id.physics.energy import energy_balance as energy_balance
@@ -79,9 +83,8 @@ _PUBLIC = {
     "errors": ("InputError",),
     "importing": ("propose_entry",),
     "inference.compare": ("compare_models", "compare_points"),
-    "motions.operating": ("draws_diagram",),
     "motions.response": ("Response", "Settling", "response"),
-    "motions.sweep": ("continuation", "diagram", "motion_map"),
+    "motions.sweep": ("continuation", "diagram", "draws_diagram", "motion_map"),
     "physics.drive": ("Excitation",),
     "physics.drives": ("Pulses", "RecordedDrive", "RodMotion"),
     "physics.energy": ("energy_balance",),

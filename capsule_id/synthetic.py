@@ -105,7 +105,8 @@ def synthesize(
     behind = {label: known for _, twin in twins for label, known in twin.truth.items()}
     tables = {table.file: table.columns for _, twin in twins for table in twin.tables}
     known = {"seed": seed, "parameters": truth, **({"runs": behind} if behind else {})}
-    _write(folder, tables, _rig_toml(name, seed, truth["g"], masses, priors, entries), known)
+    head = [f'g = {{ value = {truth["g"]:g}, unit = "m/s^2" }}', "", *(["[prior]", *priors, ""] if priors else [])]
+    _write(folder, tables, _rig_toml(name, seed, masses, MASS_SD, [*head, *entries]), known)
     return truth
 
 
@@ -138,22 +139,19 @@ def _truth_file(folder: Path) -> Path:
     return folder.resolve().with_name(folder.resolve().name + ".truth.json")
 
 
-def _rig_toml(name: str, seed: int, g: float, masses: dict[str, float], priors: list[str], entries: list[str]) -> str:
-    """The text of ``rig.toml``."""
+def _rig_toml(name: str, seed: int, masses: Mapping[str, float], sds: Mapping[str, float], lines: Iterable[str]) -> str:
+    """The text of ``rig.toml``; ``masses`` and their ``sds`` in kg, ``lines`` behind them."""
     head = [
         f"# SYNTHETIC: computed with known parameters (seed {seed}), not measured.",
         "[rig]",
         f'name = "{name}"',
         "synthetic = true",
         *(
-            f'{symbol} = {{ value = {1e3 * value:.3f}, sd = {1e3 * MASS_SD[symbol]:g}, unit = "g" }}'
+            f'{symbol} = {{ value = {1e3 * value:.3f}, sd = {1e3 * sds[symbol]:g}, unit = "g" }}'
             for symbol, value in masses.items()
         ),
-        f'g = {{ value = {g:g}, unit = "m/s^2" }}',
-        "",
-        *(["[prior]", *priors, ""] if priors else []),
     ]
-    return "\n".join([*head, *entries])
+    return "\n".join([*head, *lines])
 
 
 # robot: Synthetic progressions of a capsule robot: pulses of a coil inside the capsule, no support spring.
@@ -247,43 +245,26 @@ def synthesize_robot(
     InputError
         If ``folder`` is not empty, or the model cannot complete a trial.
     """
-    design, truth = design or RobotDesign(), {**ROBOT, **(values or {})}
-    if values and "mu" in values and "mu_back" not in values:
-        truth["mu_back"] = truth["mu"]
+    design, values = design or RobotDesign(), values or {}
+    truth = {**ROBOT, "mu_back": values.get("mu", ROBOT["mu"]), **values}
     _check_new(folder)
     columns = robot_progression(seed, design, truth)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
     masses = {name: truth[name] * (1.0 + MASS_SHARE * rng.standard_normal()) for name in ("m1", "m2")}
-    stated = "\n".join(
-        f'{name} = {{ value = {1e3 * mass:.3f}, sd = {1e3 * MASS_SHARE * mass:.3f}, unit = "g" }}'
-        for name, mass in masses.items()
+    lines = (
+        "",
+        "[model]",
+        model or 'reaction = "capsule"\nfree = ["ratio", "lag"]',
+        "",
+        "[[experiment]]",
+        'kind = "progression"',
+        'file = "progression.csv"',
+        'drive = "pulses"',
+        f'P_on = {{ value = 0, sd = {P_ON_SD:g}, unit = "N" }}',
+        f'distance_sd = {{ value = {1e3 * design.reading_sd:g}, unit = "mm" }}',
+        "",
     )
-    text = RIG.format(
-        seed=seed,
-        name=folder.resolve().name,
-        masses=stated,
-        model=model or 'reaction = "capsule"\nfree = ["ratio", "lag"]',
-        P_on_sd=P_ON_SD,
-        reading=1e3 * design.reading_sd,
-    )
+    sds = {name: round(MASS_SHARE * mass, 6) for name, mass in masses.items()}
+    text = _rig_toml(folder.resolve().name, seed, masses, sds, lines)
     known = {"seed": seed, "parameters": {**truth, "session_sd": design.session_sd}}
     _write(folder, {"progression.csv": columns}, text, known)
-
-
-RIG = """\
-# SYNTHETIC: computed with known parameters (seed {seed}), not measured.
-[rig]
-name = "{name}"
-synthetic = true
-{masses}
-
-[model]
-{model}
-
-[[experiment]]
-kind = "progression"
-file = "progression.csv"
-drive = "pulses"
-P_on = {{ value = 0, sd = {P_on_sd:g}, unit = "N" }}
-distance_sd = {{ value = {reading:g}, unit = "mm" }}
-"""

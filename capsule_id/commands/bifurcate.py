@@ -261,7 +261,7 @@ def _dataset(
     args: argparse.Namespace, axes: Sequence[Axis], values: dict[str, float], work: dict[str, Any]
 ) -> "xr.Dataset":
     """The Dataset for the options."""
-    from capsule_id.motions import operating, sweep
+    from capsule_id.motions import sweep
     from capsule_id.motions.response import Settling
     from capsule_id.report.netcdf import read_draws
 
@@ -284,7 +284,7 @@ def _dataset(
     x = {axis.name: axis.values() for axis in axes}
     (over, grid), *_ = x.items()
     if args.posterior is not None:
-        return operating.bands(operating.draws_diagram(p, e, over, grid, settling=settling, **work))
+        return sweep.bands(sweep.draws_diagram(p, e, over, grid, settling=settling, **work))
     if len(axes) == 2:
         return sweep.motion_map(p, e, x, settling=settling, **work)
     plain = {"settling": settling, "progress": work["progress"]}

@@ -25,13 +25,13 @@ from capsule_id.experiments.friction_model import (
     ground_parameters,
     other_laws,
 )
-from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.experiments.point_test import PointTest
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.model import CapsuleParameters, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
+from capsule_id.records.tones import stated_gap
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Facts, Finding
 
@@ -76,16 +76,13 @@ class CapsuleForward(GroundExperiment):
     reaction: float = eqx.field(static=True)
 
     event_driven = True
+    masses = ("m1", "m2")
 
     def set_model(self, table: Table, rig: Rig, friction: FrictionModel) -> None:
         """Set friction law, ground, engine and reaction, as [model] and the table state them."""
         self.friction, self.ground = friction, ground_of(table)
         self.smoothing = Smoothing() if rig.model.engine == "smooth" else None
         self.reaction = rig.model.share_of_reaction
-
-    @property
-    def masses(self) -> tuple[str, ...]:
-        return ("m1", "m2")
 
     def with_smoothing(self, widths: Smoothing | None) -> Self:
         """Return the same readings with the smoothed model of ``widths``; None: the exact model."""
@@ -131,8 +128,6 @@ OFF = Excitation(0.0, 1.0)
 #: Simulated duration of a push relative to the duration of a slide over the recorded distance, before the rod's decay.
 #: A surface with this much less friction than the readings imply is far outside the posterior.
 SLIDES, REST = 6.0, 0.5
-#: Gap of a support spring out of reach, m.
-FAR = 1e3
 
 
 class CapsuleDecay(CapsuleForward, FreeVibration):
@@ -145,11 +140,15 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
 
     checks = ()
     tables = ()
+    model_name = "capsule model"  # pyright: ignore[reportAssignmentType]
+    #: The capsule takes energy when it slips, so that no period repeats.
+    cycles = None  # pyright: ignore[reportAssignmentType]
+    summaries = Experiment.summaries
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         DecayRecord.__init__(self, table, rig, friction, DecayModel())
         self.set_model(table, rig, friction)
-        gap = table.settings.gap or Quantity(FAR)
+        gap = stated_gap(table)
         self.gap = gap.value if gap.sd == 0.0 else None
         rows = [parameter("k1"), parameter("c"), *friction.parameters]
         rows += [] if table.settings.gap is None else [parameter("k2", table.settings.spring)]
@@ -164,24 +163,12 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
         return Experiment.second_models(records, readings)
 
-    @property
-    def model_name(self) -> str:
-        return "capsule model"
-
-    @property
-    def cycles(self) -> Any:
-        """None: the capsule takes energy when it slips, so that no period repeats."""
-        return None
-
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
         p = self.parameters_of(theta, theta.get("k2", 0.0), theta["G"] if self.gap is None else self.gap)
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
         times = jnp.multiply.outer(stretch(self.clock_rate, theta), self.time)
         t = self.simulated(theta, p, OFF, times, initial)
         return self.values - xp.asarray(t.X1 - t.X2), self.width * xp.ones((self.n, 1))
-
-    def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
-        return Experiment.summaries(self, theta, xp)
 
     def starts(self) -> dict[str, Start]:
         starts = super().starts() | starts_of_motion(self, self.rough)
@@ -213,5 +200,5 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         v = jnp.asarray(x["speed"])
         still, end = jnp.zeros_like(v), jnp.asarray(self.horizon)
         times = jnp.stack([still, end], axis=1)
-        t = self.simulated(theta, self.parameters_of(theta, 0.0, FAR), OFF, times, (still, v, still, v))
+        t = self.simulated(theta, self.parameters_of(theta, 0.0, np.inf), OFF, times, (still, v, still, v))
         return t.X2[:, -1]

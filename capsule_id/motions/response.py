@@ -1,7 +1,8 @@
 """The settled motion of a drive: period, direction, contacts, mean velocity, and the paper's label P-<n>-<F|B|S>-<m>."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -9,13 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.motions.lyapunov import largest_exponent
 from capsule_id.physics.batches import CHUNK, is_traced, lanes_of, run_lanes
 from capsule_id.physics.drive import Drive, Excitation, PeriodicDrive
-from capsule_id.physics.exact.engine import RunState, initial_lanes, kernel, take_step
-from capsule_id.physics.exact.taylor import CapsuleState, Constants, StepSeries, constants_of, touching
+from capsule_id.physics.exact.engine import RunState, initial_lanes, kernel, run, take_step
+from capsule_id.physics.exact.taylor import CapsuleState, StepSeries, constants_of, touching
 from capsule_id.physics.friction import FrictionLaw, friction_law, horner
 from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Status, without_absent
+
+# Initial state at rest at the origin.
+REST: Initial = (0.0, 0.0, 0.0, 0.0)
+# Periods over which the Lyapunov exponent of an aperiodic motion is a mean.
+EXPONENT_PERIODS = 100
+
 
 # periods: What happens within single periods of the drive: closings of the gap, and the work of the drive.
 #
@@ -45,14 +51,6 @@ class SpanRecord(NamedTuple):
     status: jax.Array
 
 
-class PeriodRecords(NamedTuple):
-    """closings (lanes, periods), int; work (lanes, periods), J; status (lanes,), the gravest of the periods."""
-
-    closings: np.ndarray
-    work: np.ndarray
-    status: np.ndarray
-
-
 def observe(
     p: CapsuleParameters,
     e: Drive,
@@ -62,8 +60,8 @@ def observe(
     merge_contacts: float,
     max_steps: int,
     width: int = CHUNK,
-) -> PeriodRecords:
-    """Closings and work of each period of motions whose states at the periods' ends are known.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(closings, work, status) of motions whose states at the periods' ends are known: each period, the gravest status.
 
     Parameters
     ----------
@@ -72,6 +70,10 @@ def observe(
     states : (4, lanes, periods + 1), X1, Y1, X2, Y2 there; NaN where a run was given up
     merge_contacts : s; an opening shorter than this does not part two contacts
     width : lanes of one call, see ``run_lanes``
+
+    Returns
+    -------
+    (lanes, periods), int; (lanes, periods), J; (lanes,)
     """
     lanes, periods = times.shape[0], times.shape[1] - 1
     begin = tuple(np.nan_to_num(x[:, :-1]).ravel() for x in states)
@@ -81,11 +83,10 @@ def observe(
     merge = np.full(lanes * periods, merge_contacts)
     spans_of_lanes = run_lanes(_kernel, (p, e, law, (begin, merge, bound)), spans, batched=True, width=width)
     closings, lead, opened, work, status = (np.array(x).reshape(lanes, periods) for x in spans_of_lanes)
-    last = np.full(lanes, -np.inf)
-    for i in range(periods):
-        closings[:, i] -= lead[:, i] - last < merge_contacts
-        last = np.maximum(last, opened[:, i])
-    return PeriodRecords(closings, work, status.max(axis=1))
+    # The last opening in the periods before each one.
+    last = np.concatenate([np.full((lanes, 1), -np.inf), np.maximum.accumulate(opened, axis=1)[:, :-1]], axis=1)
+    closings -= lead - last < merge_contacts
+    return closings, work, status.max(axis=1)
 
 
 @jax.jit
@@ -106,27 +107,20 @@ def _kernel(
     def one(carry: tuple[RunState, SpanRecord]) -> tuple[RunState, SpanRecord]:
         lanes, record = carry
         after, step = take_step(constants, end, bound, lanes)
-        return after, _with_step(constants, lanes, after, step, merge, record)
+        t = after.state.t
+        held, holds = (touching(constants, moment.mode, 1.0) for moment in (lanes, after))
+        closed, opened = holds & ~held, held & ~holds
+        record = SpanRecord(
+            record.closings + (closed & ~(t - record.opened < merge)),
+            jnp.where(closed & jnp.isinf(record.opened), t, record.lead),
+            jnp.where(opened, t, record.opened),
+            # A lane that has ended adds nothing.
+            record.work + jnp.where(lanes.active, _work(constants.drive, lanes.state, step, t), 0.0),
+            after.status,
+        )
+        return after, record
 
     return jax.lax.while_loop(lambda carry: jnp.any(carry[0].active), one, (lanes, blank))[1]
-
-
-def _with_step(
-    constants: Constants, before: RunState, after: RunState, step: StepSeries, merge: jax.Array, record: SpanRecord
-) -> SpanRecord:
-    """``record`` with one step added; a lane that has ended adds nothing."""
-    t = after.state.t
-    held, holds = (touching(constants, run.mode, 1.0) for run in (before, after))
-    closed, opened = holds & ~held, held & ~holds
-    counted = closed & ~(t - record.opened < merge)
-    first = closed & jnp.isinf(record.opened)
-    return SpanRecord(
-        record.closings + counted,
-        jnp.where(first, t, record.lead),
-        jnp.where(opened, t, record.opened),
-        record.work + jnp.where(before.active, _work(constants.drive, before.state, step, t), 0.0),
-        after.status,
-    )
 
 
 def _work(drive: Drive, state: CapsuleState, step: StepSeries, t: jax.Array) -> jax.Array:
@@ -142,6 +136,102 @@ def _work(drive: Drive, state: CapsuleState, step: StepSeries, t: jax.Array) -> 
         return drive.series(state.drive, state.t + since, 1.0, 1)[0] * driven
 
     return dt * jnp.sum(_WEIGHT[:, None] * jax.vmap(power)(jnp.asarray(_NODE)), axis=0)
+
+
+# exponent: The largest Lyapunov exponent, from the exact derivatives of the engine through every event.
+#
+# A tangent of the Poincaré map is carried along and brought back to unit length once a period; the exponent is the mean
+# rate at which its logarithm grows. Coordinates: (x_rel, its rate, Y2) at the drive's phase. X2 is left out: a motion
+# that is shifted as a whole is the same motion; its tangent neither grows nor decays and would hide all others.
+# In a capsule that sticks Y2 and its tangent are 0, and the map has one dimension less.
+
+
+# Excitation periods in which the tangent turns into the direction that grows most, before its growth counts.
+ALIGNMENT = 16
+# The tangent's direction at the start; any that is not special.
+DIRECTION = (0.8, -0.5, 0.33)
+
+
+def largest_exponent(
+    p: CapsuleParameters,
+    e: PeriodicDrive,
+    initial: Initial = REST,
+    periods: int = EXPONENT_PERIODS,
+    max_steps: int = MAX_STEPS,
+    friction: FrictionLaw | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Largest Lyapunov exponent of motions that start at ``initial`` (a settled state, as ``settle(...).end``), and status.
+
+    Parameters
+    ----------
+    p, e : parameters and drive; leaves () or (batch,), concrete; the period positive
+    initial : (X1, Y1, X2, Y2) at the drive's phase, each () or (batch,); default at rest at the origin
+    periods, max_steps : see ``Settling``; growth counts after 16 periods in which the tangent aligns
+    friction : a law in place of the capsule's own, see ``simulate``
+
+    Returns
+    -------
+    (lanes,) 1/s, NaN where a lane failed, -inf where every tangent dies out; (lanes,) the gravest ``Status`` code,
+    ``GRAZING`` where a derivative on the way does not exist.
+
+    For a periodic orbit the limit is log|largest Floquet multiplier| / (n T), which is negative where it is stable.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not agree.
+    """
+    (p, e, friction, (X1, Y1, X2, Y2)), _, _ = lanes_of((*without_absent(p, e), friction, initial), np.zeros(1))
+    law = friction_law(p, friction)
+    T = np.asarray(e.period)
+    begin = tuple(np.nan_to_num(x) for x in (X1 - X2, Y1 - Y2, Y2))
+    span = np.stack([np.zeros_like(T), T], axis=1)
+    grow = partial(_growth, np.int32(periods), np.int32(max_steps))
+    growth, status = (np.asarray(x) for x in run_lanes(grow, (p, e, law, begin), span, batched=True))
+    return np.where(status <= Status.GRAZING, growth / (periods * T), np.nan), status
+
+
+@jax.jit
+def _growth(
+    periods: jax.Array,
+    max_steps: jax.Array,
+    p: CapsuleParameters,
+    e: PeriodicDrive,
+    law: FrictionLaw,
+    begin: tuple[jax.Array, ...],
+    span: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """(logarithm of the tangent's growth over ``periods``, status), each (L,); begin: x_rel, rate, Y2, each (L,).
+
+    Seven arguments, because the engine's inputs are unpacked.
+    """
+    # Lengths in m: a velocity counts as the displacement that it makes in 1/Omega.
+    Omega = 2.0 * jnp.pi / jnp.asarray(e.period)
+    unit = jnp.stack([jnp.ones_like(Omega), Omega, Omega])
+
+    def period(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x_rel, rate, Y2 = y
+        bound = jnp.broadcast_to(max_steps, x_rel.shape)
+        t = run(p, e, law, (x_rel, rate + Y2, jnp.zeros_like(x_rel), Y2), span, span[:, 1], bound)
+        return jnp.stack([t.x_rel[:, -1], (t.Y1 - t.Y2)[:, -1], t.Y2[:, -1]]), t.status
+
+    def one(k: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        y, tangent, total, status = carry
+        y, moved, now = jax.jvp(period, (y,), (tangent * unit,), has_aux=True)
+        moved = moved / unit
+        length = jnp.sqrt(jnp.sum(moved**2, axis=0))
+        total = total + jnp.where(k < ALIGNMENT, 0.0, jnp.log(length))
+        # A tangent that has died out stays zero; its logarithm is -inf.
+        moved = moved / jnp.where(length > 0.0, length, 1.0)[None]
+        return y, moved, total, jnp.where(status <= Status.GRAZING, jnp.maximum(status, now), status)
+
+    y = jnp.stack(begin)
+    tangent = jnp.broadcast_to(jnp.asarray(DIRECTION)[:, None], y.shape)
+    # A capsule that sticks has no tangent in velocity.
+    tangent = tangent.at[2].set(jnp.where(y[2] == 0.0, 0.0, tangent[2]))
+    blank = (y, tangent, jnp.zeros_like(span[:, 0]), jnp.zeros(span.shape[0], jnp.int32))
+    _, _, total, status = jax.lax.fori_loop(0, ALIGNMENT + periods, one, blank)
+    return total, status
 
 
 # response: The settled motion in one line: period, direction, contacts, mean velocity, and the paper's label
@@ -160,8 +250,6 @@ LONGEST, REPEATS = 16, 3
 SAME_POSITION, SAME_VELOCITY, SAME_RELATIVE = 1e-7, 1e-4, 1e-3
 # A capsule that advances less than this per excitation period (m) stands still.
 STANDING = 1e-7
-# Periods over which the Lyapunov exponent of an aperiodic motion is a mean.
-EXPONENT_PERIODS = 100
 
 
 @dataclass(frozen=True)
@@ -229,11 +317,13 @@ class Settled(Response):
     """Settled motions with their Poincaré sections, every field an array (lanes, ...).
 
     x_rel, rate, Y2 : (lanes, observed + 1), m and m/s: X1 - X2, Y1 - Y2 and Y2 at the drive's phase at the start
+    efficiency : (lanes,) advance of the capsule per work of the drive, m/J; 0 for a motion that stands
     """
 
     x_rel: np.ndarray
     rate: np.ndarray
     Y2: np.ndarray
+    efficiency: np.ndarray
 
     @property
     def end(self) -> Initial:
@@ -270,7 +360,7 @@ def response(
     p, e = without_absent(p, e)
     _, _, batched = lanes_of((p, e, friction), np.zeros(1))
     if max_steps is not None:
-        settling = Settling(**{**vars(settling), "max_steps": max_steps})
+        settling = replace(settling, max_steps=max_steps)
     seen = settle(p, e, settling=settling, friction=friction)
     columns = (getattr(seen, field.name) for field in fields(Response))
     return Response(*(column if batched else column[0].item() for column in columns))
@@ -279,7 +369,7 @@ def response(
 def settle(
     p: CapsuleParameters,
     e: PeriodicDrive,
-    initial: Initial | None = None,
+    initial: Initial = REST,
     settling: Settling = SETTLING,
     width: int = CHUNK,
     friction: FrictionLaw | None = None,
@@ -298,8 +388,7 @@ def settle(
     InputError
         A drive without a positive period, a merging time that would take in whole periods, shapes that do not agree.
     """
-    given = (p, e, friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
-    (p, e, friction, initial), _, _ = lanes_of(given, np.zeros(1))
+    (p, e, friction, initial), _, _ = lanes_of((p, e, friction, initial), np.zeros(1))
     law = friction_law(p, friction)
     T = periods_of(e)
     if not settling.merge_contacts < 0.5 * T.min():
@@ -310,19 +399,21 @@ def settle(
     section = T[:, None] * np.arange(settling.dropped - before, settling.dropped + settling.observed + 1)
     # The start comes first, which the section begins with where (almost) nothing is dropped.
     times = np.concatenate([np.zeros((len(T), 1)), section], axis=1) if settling.dropped > 1 else section
-    run = run_lanes(kernel(settling.max_steps), (p, e, law, initial), times, batched=True, width=width)
-    states = np.stack([np.asarray(x)[:, -section.shape[1] :] for x in (run.X1, run.Y1, run.X2, run.Y2)])
+    t = run_lanes(kernel(settling.max_steps), (p, e, law, initial), times, batched=True, width=width)
+    states = np.stack([np.asarray(x)[:, -section.shape[1] :] for x in (t.X1, t.Y1, t.X2, t.Y2)])
     seen = observe(p, e, law, section, states, settling.merge_contacts, settling.max_steps, width)
-    states, closings = states[:, :, before:], seen.closings[:, before:]
-    status = np.maximum(np.asarray(run.status), seen.status)
+    states, closings, work = states[:, :, before:], seen[0][:, before:], seen[1][:, before:]
+    status = np.maximum(np.asarray(t.status), seen[2])
     found = [_describe(states[:, i], 2.0 * np.pi / T[i], closings[i], int(status[i])) for i in range(len(T))]
     label, period, direction, per_period = (np.array(column) for column in zip(*found, strict=True))
     X1, Y1, X2, Y2 = states
     velocity = (X2[:, -1] - X2[:, 0]) / (settling.observed * T)
-    work = np.where(np.isfinite(velocity), seen.work[:, before:].mean(axis=1), np.nan)
-    exponent = exponents(p, e, tuple(states[:, :, -1]), label == "aperiodic", settling, friction)
-    columns = (settled_label(label, exponent), period, direction, per_period, velocity, status, work, exponent)
-    return Settled(*columns, x_rel=X1 - X2, rate=Y1 - Y2, Y2=Y2)
+    work = np.where(np.isfinite(velocity), work.mean(axis=1), np.nan)
+    # Without a drive there is neither work nor advance.
+    efficiency = np.where(direction == "S", 0.0, velocity * T / np.where(work == 0.0, np.inf, work))
+    label, exponent = with_exponents(p, e, tuple(states[:, :, -1]), label, settling, friction)
+    columns = (label, period, direction, per_period, velocity, status, work, exponent)
+    return Settled(*columns, x_rel=X1 - X2, rate=Y1 - Y2, Y2=Y2, efficiency=efficiency)
 
 
 def periods_of(e: PeriodicDrive) -> np.ndarray:
@@ -343,26 +434,24 @@ def periods_of(e: PeriodicDrive) -> np.ndarray:
     return np.asarray(e.period)
 
 
-def exponents(
+def with_exponents(
     p: CapsuleParameters,
     e: PeriodicDrive,
     ends: tuple[np.ndarray, ...],
-    chosen: np.ndarray,
+    label: np.ndarray,
     settling: Settling,
     friction: FrictionLaw | None = None,
-) -> np.ndarray:
-    """(lanes,) 1/s: Lyapunov exponents of lanes from the states ``ends`` where ``chosen`` (lanes,), NaN elsewhere."""
-    found = np.full(len(chosen), np.nan)
+) -> tuple[np.ndarray, np.ndarray]:
+    """(label, exponent) of lanes that end in the states ``ends``, (lanes,) and (lanes,) 1/s.
+
+    Aperiodic motions have an exponent, all others NaN. Those with a negative one are "not settled".
+    """
+    found, chosen = np.full(len(label), np.nan), label == "aperiodic"
     if settling.exponent_periods and chosen.any():
         p, e, friction, (X1, Y1, X2, Y2) = jax.tree.map(lambda leaf: leaf[chosen], (p, e, friction, ends))
-        rates = largest_exponent(p, e, (X1, Y1, X2, Y2), settling.exponent_periods, settling.max_steps, friction)
-        found[chosen] = rates.exponent
-    return found
-
-
-def settled_label(label: np.ndarray, exponent: np.ndarray) -> np.ndarray:
-    """Labels (lanes,), "not settled" in the place of "aperiodic" where the exponent (lanes,) is negative."""
-    return np.where((label == "aperiodic") & (exponent < 0.0), "not settled", label)
+        numbers = settling.exponent_periods, settling.max_steps
+        found[chosen] = largest_exponent(p, e, (X1, Y1, X2, Y2), *numbers, friction)[0]
+    return np.where(found < 0.0, "not settled", label), found
 
 
 def _describe(state: np.ndarray, Omega: float, contacts: np.ndarray, status: int) -> tuple[str, int, str, float]:

@@ -1,13 +1,13 @@
-"""Bifurcation diagrams, two-parameter maps, basins of attraction: settled motions over any quantity of the model."""
+"""Bifurcation diagrams, two-parameter maps, bands over draws, basins of attraction: settled motions over any quantity."""
 
 import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import jax
 import numpy as np
@@ -19,14 +19,14 @@ from capsule_id import console
 from capsule_id.console import OnProgress, stop_if_interrupted
 from capsule_id.errors import InputError, writing
 from capsule_id.motions.response import (
+    REST,
     SAME_POSITION,
     SAME_VELOCITY,
     SETTLING,
     Settled,
     Settling,
-    exponents,
     settle,
-    settled_label,
+    with_exponents,
 )
 from capsule_id.output import replace_file
 from capsule_id.parameters import CAPSULE_LEAVES, LEAVES, SWEPT
@@ -87,7 +87,7 @@ class SweepPoints:
 
 
 def sweep_points(
-    p: CapsuleParameters, e: PeriodicDrive, over: Mapping[str, np.ndarray], initial: Initial | None = None
+    p: CapsuleParameters, e: PeriodicDrive, over: Mapping[str, np.ndarray], initial: Initial = REST
 ) -> SweepPoints:
     """The lanes in which the quantities of ``over`` (symbol -> (points,), SI; ``f`` in Hz) replace those of p and e.
 
@@ -107,32 +107,16 @@ def sweep_points(
     if "f" in leaves:
         f, frequency = leaves.pop("f"), swept_leaf("f", e)
         leaves[frequency] = 2.0 * np.pi * f if frequency == "Omega" else 1.0 / f
-    p = replace(p, **{name: x for name, x in leaves.items() if LEAVES[name].leaf == "capsule"})
-    drive: Any = e
-    e = replace(drive, **{name: x for name, x in leaves.items() if LEAVES[name].leaf == "drive"})
+    kinds = ("capsule", "drive")
+    of_p, of_e = ({name: x for name, x in leaves.items() if LEAVES[name].leaf == kind} for kind in kinds)
     # What is absent is absent in all blocks of a sweep, so a point does not depend on its block.
-    p, e = without_absent(p, e)
-    lanes, _, _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
-    return SweepPoints(*lanes)
+    p, e = without_absent(replace(p, **of_p), replace(cast(Any, e), **of_e))
+    return SweepPoints(*lanes_of((p, e, initial), np.zeros(1))[0])
 
 
 def swept_leaf(name: str, e: PeriodicDrive) -> str:
     """The leaf that a swept quantity sets: ``f`` is Omega or the period of pulses."""
     return name if name != "f" else "Omega" if isinstance(e, Excitation) else "period"
-
-
-def settled_columns(points: SweepPoints, settling: Settling) -> MotionColumns:
-    """All columns of the settled motions, by the names of ``MOTION_COLUMNS``."""
-    return motion_columns(settle(points.p, points.e, points.initial, settling), points)
-
-
-def motion_columns(seen: Settled, points: SweepPoints) -> MotionColumns:
-    """The fields of ``seen`` and the efficiency of each motion, 0 for one that stands."""
-    found: MotionColumns = {name: np.asarray(getattr(seen, name)) for name in MOTION_COLUMNS if name != "efficiency"}
-    advance = found["mean_velocity"] * np.asarray(points.e.period)
-    # Without a drive there is neither work nor advance.
-    work = np.where(found["work_per_period"] == 0.0, np.inf, found["work_per_period"])
-    return found | {"efficiency": np.where(found["direction"] == "S", 0.0, advance / work)}
 
 
 # attractors: Which motions are the same attractor: by direction and period, contacts, and the points of the Poincaré
@@ -152,17 +136,12 @@ def attractors_of(columns: MotionColumns) -> np.ndarray:
     to where they begin. Aperiodic motions count as one: their points, and the sign of a slow drift, cannot be matched.
     """
     label, period = columns["label"], columns["period"]
-    numbers = np.full(len(label), -1, np.int32)
-    found: list[int] = []
-    for i in range(len(label)):
-        if label[i] == "failed":
-            continue
-        for number, j in enumerate(found):
-            if label[i] == label[j] and (period[i] == 0 or _same_orbit(columns, i, j, int(period[i]))):
-                numbers[i] = number
-                break
-        else:
-            numbers[i] = len(found)
+    numbers, found = np.full(len(label), -1, np.int32), list[int]()
+    for i in np.flatnonzero(label != "failed").tolist():
+        alike = (k for k, j in enumerate(found) if label[i] == label[j])
+        same = (k for k in alike if period[i] == 0 or _same_orbit(columns, i, found[k], int(period[i])))
+        numbers[i] = next(same, len(found))
+        if numbers[i] == len(found):
             found.append(i)
     return numbers
 
@@ -217,18 +196,24 @@ def compute(
     InputError
         A store that belongs to other points.
     """
-    begins = range(0, points.size, block)
+    begins, parts = range(0, points.size, block), dict[int, MotionColumns]()
     if store is not None:
         _check_store(store, points, settling, keep, block)
         console.saved.set()
-    saved = ((begin, _saved_block(store, begin)) for begin in begins)
-    parts = {begin: part for begin, part in saved if part is not None}
-    missing = {begin: slice(begin, begin + block) for begin in begins if begin not in parts}
+        saved = ((begin, _saved_block(store, begin)) for begin in begins)
+        parts = {begin: part for begin, part in saved if part is not None}
+    missing = [begin for begin in begins if begin not in parts]
     done = sum(len(part["status"]) for part in parts.values())
     _report(progress, done, points.size)
-    for begin, part in _blocks(points, settling, tuple(keep), missing, client):
+    tasks = ((points.part(slice(begin, begin + block)), settling, tuple(keep)) for begin in missing)
+    computed = (settled_block(*task) for task in tasks)
+    if client is not None:
+        futures = [client.submit(settled_block, *task, pure=False) for task in tasks]
+        computed = (future.result() for future in futures)
+    for i, (begin, part) in enumerate(zip(missing, computed, strict=True)):
         parts[begin] = part
-        _save_block(store, begin, part, len(begins) - len(parts) + 1)
+        if store is not None:
+            _save_block(store, begin, part, len(missing) - i)
         done += len(part["status"])
         _report(progress, done, points.size)
     return {name: np.concatenate([parts[begin][name] for begin in begins]) for name in keep}
@@ -236,35 +221,14 @@ def compute(
 
 def settled_block(points: SweepPoints, settling: Settling, keep: Sequence[str]) -> MotionColumns:
     """One block: the named columns and the status."""
-    seen = settled_columns(points, settling)
-    return {name: seen[name] for name in dict.fromkeys((*keep, "status"))}
+    seen = settle(points.p, points.e, points.initial, settling)
+    return {name: getattr(seen, name) for name in (*keep, "status")}
 
 
-def _blocks(
-    points: SweepPoints,
-    settling: Settling,
-    keep: Sequence[str],
-    missing: Mapping[int, slice],
-    client: "Client | None",
-) -> Iterator[tuple[int, MotionColumns]]:
-    """(begin, columns) of each missing block, from this process or from a cluster, as they are finished."""
-    if client is None:
-        yield from ((begin, settled_block(points.part(part), settling, keep)) for begin, part in missing.items())
-        return
-    from distributed import as_completed
-
-    futures: dict[Any, int] = {
-        client.submit(settled_block, points.part(part), settling, keep, pure=False): begin
-        for begin, part in missing.items()
-    }
-    for future, columns in as_completed(list(futures), with_results=True):
-        yield futures[future], columns
-
-
-def _report(progress: OnProgress | None, done: int, total: int) -> None:
+def _report(progress: OnProgress | None, done: int, total: int, what: str = "points") -> None:
     stop_if_interrupted()
     if progress is not None:
-        progress(done, total, "points")
+        progress(done, total, what)
 
 
 def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Sequence[str], block: int) -> None:
@@ -279,39 +243,31 @@ def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Seq
         "block": block,
         "jax": jax.__version__,
     }
+    file, text = store / FINGERPRINT, json.dumps(mine, indent=1)
     with writing(store):
         store.mkdir(parents=True, exist_ok=True)
-    file = store / FINGERPRINT
-    if file.exists():
-        try:
-            theirs = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError:
-            theirs = None
-        if theirs != json.loads(json.dumps(mine)):
-            remedy = "repeat the command with the same points, or remove the folder"
-            raise InputError("finished blocks are reused for the same points only", "other points", remedy, store)
-        return
-    if any(store.iterdir()):
-        raise InputError("a store is a new folder or one of this program", "it is neither", "name another one", store)
-    replace_file(file, json.dumps(mine, indent=1))
+    if not file.exists():
+        if any(store.iterdir()):
+            rule = "a store is a new folder or one of this program"
+            raise InputError(rule, "it is neither", "name another one", store)
+        replace_file(file, text)
+    elif file.read_bytes() != text.encode():
+        remedy = "repeat the command with the same points, or remove the folder"
+        raise InputError("finished blocks are reused for the same points only", "other points", remedy, store)
 
 
 def _file(store: Path, begin: int) -> Path:
     return store / f"block_{begin:09d}.npz"
 
 
-def _save_block(store: Path | None, begin: int, part: MotionColumns, left: int) -> None:
+def _save_block(store: Path, begin: int, part: MotionColumns, left: int) -> None:
     """Save a block; ``left`` blocks are still to be saved, with this one."""
-    if store is None:
-        return
     np.savez(content := io.BytesIO(), **part)  # pyright: ignore[reportArgumentType]  (names are ours: none is "file")
     replace_file(_file(store, begin), content.getvalue(), left * content.tell())
 
 
-def _saved_block(store: Path | None, begin: int) -> MotionColumns | None:
+def _saved_block(store: Path, begin: int) -> MotionColumns | None:
     """A saved block; None if there is none or it cannot be read."""
-    if store is None or not _file(store, begin).exists():
-        return None
     try:
         with _file(store, begin).open("rb") as file, np.load(file, allow_pickle=False) as saved:
             return {name: saved[name] for name in saved.files}
@@ -324,20 +280,6 @@ def _saved_block(store: Path | None, begin: int) -> MotionColumns | None:
 
 ATTRACTOR = {"units": "1", "long_name": "number of the attractor among those found here, -1 if the run failed"}
 ATTRACTORS = {"units": "1", "long_name": "number of different attractors found here"}
-
-
-def grid_of(over: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
-    """The quantities that are varied, symbol -> values (n,), checked.
-
-    Raises
-    ------
-    InputError
-        A quantity that does not exist, values that are no list of finite numbers.
-    """
-    for name in over:
-        if name not in SWEPT:
-            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(SWEPT)}")
-    return {name: values_of(name, values) for name, values in over.items()}
 
 
 def single(p: CapsuleParameters, e: PeriodicDrive) -> tuple[CapsuleParameters, PeriodicDrive]:
@@ -373,8 +315,11 @@ def provenance(
     """Attributes: every parameter that is not swept, and how the motions were settled."""
     swept = {swept_leaf(name, e) for name in over}
     given = {**vars(p), **vars(e)}
-    held = {name: x for name, x in given.items() if name not in swept and x is not None}
-    held = {name: str(x) if name == "forces" else float(np.asarray(x)) for name, x in held.items()}
+    held = {
+        name: str(x) if name == "forces" else float(np.asarray(x))
+        for name, x in given.items()
+        if name not in swept and x is not None
+    }
     return {**held, **asdict(settling), "method": method, "model": "exact", "semantics": "stick-slip"}
 
 
@@ -389,10 +334,9 @@ def dataset_of(
     variables = {}
     for name, column in seen.items():
         unit, meaning = MOTION_COLUMNS[name]
-        extra = ("section",) if name in SECTION and "branch" in dims else ()
-        if name in SUMMARY or extra:
-            values = column.reshape(*shape, *column.shape[1:])
-            variables[name] = ((*dims, *extra), values, {"units": unit, "long_name": meaning})
+        values = column.reshape(*shape, *column.shape[1:])
+        extra = ("section",) if name in SECTION else ()
+        variables[name] = ((*dims, *extra), values, {"units": unit, "long_name": meaning})
     coordinates = {
         name: (name, x, {"units": SWEPT[name].unit, "long_name": SWEPT[name].meaning}) for name, x in grid.items()
     }
@@ -454,15 +398,14 @@ def diagram(
     InputError
         A quantity that does not exist, values or starts that are no list of finite numbers, leaves with a batch axis.
     """
-    grid = grid_of({over: values})
-    begin = _starts(starts)
-    branches, n = len(begin[0]), len(grid[over])
-    lanes = {over: np.tile(grid[over], branches)}
-    X1, Y1, X2, Y2 = (np.repeat(x, n) for x in begin)
-    points = sweep_points(*single(p, e), lanes, (X1, Y1, X2, Y2))
+    x, begin = values_of(over, values), _starts(starts)
+    branches = len(begin[0])
+    X1, Y1, X2, Y2 = (np.repeat(component, len(x)) for component in begin)
+    points = sweep_points(*single(p, e), {over: np.tile(x, branches)}, (X1, Y1, X2, Y2))
     seen = compute(points, settling, progress=progress)
     names = ["rest"] if starts is None else [f"start {i}" for i in range(branches)]
-    return branched(seen, names, grid, provenance(p, e, [over], settling, "rest" if starts is None else "starts"))
+    method = "rest" if starts is None else "starts"
+    return branched(seen, names, {over: x}, provenance(p, e, [over], settling, method))
 
 
 def continuation(
@@ -487,34 +430,31 @@ def continuation(
     InputError
         As ``diagram``; no direction, or one that does not exist.
     """
-    grid = grid_of({over: values})
-    begin = _starts(starts)
+    x, begin = values_of(over, values), _starts(starts)
     if not directions or not set(directions) <= {"forward", "backward"}:
         raise InputError("a direction is forward or backward", str(tuple(directions)), "give one of them or both")
-    each, x = len(begin[0]), grid[over]
-    order = np.stack([np.arange(len(x)) if way == "forward" else np.arange(len(x))[::-1] for way in directions])
-    order = np.repeat(order, each, axis=0)
+    each, places = len(begin[0]), np.arange(len(x))
+    order = np.repeat(np.stack([places if way == "forward" else places[::-1] for way in directions]), each, axis=0)
     X1, Y1, X2, Y2 = (np.tile(component, len(directions)) for component in begin)
     state: Initial = (X1, Y1, X2, Y2)
-    plain = Settling(**{**vars(settling), "exponent_periods": 0})
-    parts: list[MotionColumns] = []
+    plain, parts = replace(settling, exponent_periods=0), list[Settled]()
     for i in range(len(x)):
-        stop_if_interrupted()
-        if progress is not None:
-            progress(i, len(x), "values")
+        _report(progress, i, len(x), "values")
         points = sweep_points(*single(p, e), {over: x[order[:, i]]}, state)
         # As many lanes as there are branches: a full chunk would cost many times as much.
-        seen = settle(points.p, points.e, points.initial, plain, width=min(len(order), CHUNK))
-        parts.append(motion_columns(seen, points))
-        state = seen.end
-    place = np.argsort(order, axis=1)
-    # (value in the order of the branch, branch, ...) -> (branch, value, ...)
-    stacked = {name: np.stack([part[name] for part in parts], axis=1) for name in MOTION_COLUMNS}
-    sorted_ = {name: np.stack([a[k] for a, k in zip(column, place, strict=True)]) for name, column in stacked.items()}
-    flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in sorted_.items()}
-    _add_exponents(flat, sweep_points(*single(p, e), {over: np.tile(x, len(order))}), settling)
+        parts.append(settle(points.p, points.e, points.initial, plain, width=min(len(order), CHUNK)))
+        state = parts[-1].end
+    # (value in the order of the branch, branch, ...) -> (branch and value, ...)
+    branches, place = np.arange(len(order))[:, None], np.argsort(order, axis=1)
+    stacked = {name: np.stack([getattr(part, name) for part in parts], axis=1) for name in MOTION_COLUMNS}
+    flat = {name: np.concatenate(column[branches, place]) for name, column in stacked.items()}
+    # The exponents of all aperiodic points at once.
+    points = sweep_points(p, e, {over: np.tile(x, len(order))})
+    x_rel, rate, Y2 = (flat[name][:, -1] for name in SECTION)
+    ends = (x_rel, rate + Y2, np.zeros_like(x_rel), Y2)
+    flat["label"], flat["lyapunov"] = with_exponents(points.p, points.e, ends, flat["label"], settling)
     names = [way if each == 1 else f"{way} {i}" for way in directions for i in range(each)]
-    return branched(flat, names, grid, provenance(p, e, [over], settling, "continuation"))
+    return branched(flat, names, {over: x}, provenance(p, e, [over], settling, "continuation"))
 
 
 def motion_map(
@@ -542,7 +482,7 @@ def motion_map(
     InputError
         As ``diagram``; a store of other points.
     """
-    grid = grid_of(over)
+    grid = {name: values_of(name, values) for name, values in over.items()}
     mesh = np.meshgrid(*grid.values(), indexing="ij")
     points = sweep_points(*single(p, e), {name: axis.ravel() for name, axis in zip(grid, mesh, strict=True)})
     seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client, block=block)
@@ -574,8 +514,8 @@ def basins(
     X1, Y1 = mesh[0].ravel(), mesh[1].ravel() + Y2
     points = sweep_points(*single(p, e), {}, (X1, Y1, np.zeros_like(X1), np.full_like(X1, Y2)))
     seen = compute(points, settling, progress=progress)
-    numbers = attractors_of(seen)
-    data = dataset_of(seen, {}, tuple(axes), mesh[0].shape, provenance(p, e, [], settling, "basins") | {"Y2_0": Y2})
+    numbers, summary = attractors_of(seen), {name: seen[name] for name in SUMMARY}
+    data = dataset_of(summary, {}, tuple(axes), mesh[0].shape, provenance(p, e, [], settling, "basins") | {"Y2_0": Y2})
     data = data.assign_coords(
         x_rel_0=("x_rel_0", axes["x_rel_0"], {"units": "m", "long_name": "X1 - X2 at the start"}),
         rate_0=("rate_0", axes["rate_0"], {"units": "m/s", "long_name": "Y1 - Y2 at the start"}),
@@ -602,26 +542,119 @@ def spread_starts(p: CapsuleParameters, e: PeriodicDrive, count: int, seed: int 
     G, amplitude, k1, period = (float(np.asarray(x)) for x in (p.G, e.amplitude, p.k1, e.period))
     reach = 2.0 * max(G if np.isfinite(G) else 0.0, amplitude / k1 if k1 > 0.0 else 0.0)
     box = qmc.LatinHypercube(3, rng=np.random.default_rng(seed)).random(count)
-    Omega = 2.0 * np.pi / period
-    x_rel, rate, Y2 = ((2.0 * box - 1.0) * reach * np.array([1.0, Omega, Omega])).T
-    X1, Y1, X2, Y2 = x_rel, rate + Y2, np.zeros(count), Y2
-    for component in (X1, Y1, Y2):
-        component[0] = 0.0
-    return X1, Y1, X2, Y2
+    box[0] = 0.5
+    x_rel, rate, Y2 = ((2.0 * box - 1.0) * reach * np.array([1.0, 2.0 * np.pi / period, 2.0 * np.pi / period])).T
+    return x_rel, rate + Y2, np.zeros(count), Y2
 
 
 def _starts(starts: Initial | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    given = starts if starts is not None else (np.zeros(1),) * 4
-    columns = [
-        values_of(name, np.atleast_1d(np.asarray(x))) for name, x in zip(("X1", "Y1", "X2", "Y2"), given, strict=True)
-    ]
-    X1, Y1, X2, Y2 = np.broadcast_arrays(*columns)
+    pairs = zip(("X1", "Y1", "X2", "Y2"), starts if starts is not None else REST, strict=True)
+    X1, Y1, X2, Y2 = np.broadcast_arrays(*(values_of(name, np.atleast_1d(np.asarray(x))) for name, x in pairs))
     return X1, Y1, X2, Y2
 
 
-def _add_exponents(seen: MotionColumns, points: SweepPoints, settling: Settling) -> None:
-    """Lyapunov exponents of the aperiodic points of a continuation, all at once."""
-    x_rel, rate, Y2 = (seen[name][:, -1] for name in SECTION)
-    ends = (x_rel, rate + Y2, np.zeros_like(x_rel), Y2)
-    seen["lyapunov"] = exponents(points.p, points.e, ends, seen["label"] == "aperiodic", settling)
-    seen["label"] = settled_label(seen["label"], seen["lyapunov"])
+# operating: Diagrams for draws of the parameters: how probable each motion is, how fast, and where to operate best.
+#
+#     draws over values -> settled motions (value, draw) -> bands: probabilities, quantiles, best operating point
+#
+# Draws are arrays of leaves; they may come from anywhere.
+
+
+QUANTILES = (0.025, 0.5, 0.975)
+
+
+def draws_diagram(
+    p: CapsuleParameters,
+    e: PeriodicDrive,
+    over: str,
+    values: ArrayLike,
+    *,
+    settling: Settling = SETTLING,
+    progress: OnProgress | None = None,
+    store: "Path | None" = None,
+    client: "Client | None" = None,
+) -> xr.Dataset:
+    """Settled motions from rest at every value for every draw: a Dataset over (<over>, draw).
+
+    Parameters
+    ----------
+    p, e : leaves () or (draws,), at least one with draws
+    over, values : the quantity that is varied, (n,), SI (f in Hz)
+    store, client : see ``compute``
+
+    Eight arguments: four state the diagram, the others are options by name.
+
+    Raises
+    ------
+    InputError
+        A quantity that does not exist, no leaf with draws, values that are no list of finite numbers.
+    """
+    x = values_of(over, values)
+    if not any(np.ndim(leaf) for leaf in jax.tree.leaves((p, e))):
+        raise InputError("a posterior band needs draws", "every leaf is one number", "use diagram, or give arrays")
+    drawn, _, _ = lanes_of((p, e), np.zeros(1))
+    n, draws = len(x), len(np.asarray(drawn[0].m1))
+    p, e = jax.tree.map(lambda leaf: np.tile(leaf, n), drawn)
+    points = sweep_points(p, e, {over: np.repeat(x, draws)})
+    seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client)
+    about = {**asdict(settling), "method": "rest", "model": "exact", "semantics": "stick-slip"}
+    return dataset_of(seen, {over: x}, (over, "draw"), (n, draws), about).assign_coords(draw=np.arange(draws))
+
+
+def bands(seen: xr.Dataset, objective: str = "mean_velocity") -> xr.Dataset:
+    """Probabilities and quantiles over the draws, at each value and at the best operating point.
+
+    Parameters
+    ----------
+    seen : from ``draws_diagram``
+    objective : the quantity to maximise: "mean_velocity" (forward), or "efficiency"
+
+    Returns a Dataset with
+
+    probability (label, <over>) : share of the draws with this label, "failed" among them: over labels it sums to 1
+    <objective>_quantiles (quantile, <over>) : 2.5 %, 50 % and 97.5 % over the draws that have not failed
+    best (draw), best_<objective> (draw) : for each draw the value with the largest objective, and that objective
+    best_quantiles, best_<objective>_quantiles (quantile) : the same over the draws
+    chosen () : the value whose *mean* over the draws is largest, that is, what to set when the parameters are not
+        known better; chosen_<objective>_quantiles (quantile) : what it gives
+
+    Raises
+    ------
+    InputError
+        An objective that does not exist, draws of which every one failed at some value or at all of them.
+    """
+    if objective not in ("mean_velocity", "efficiency"):
+        raise InputError("the objective is mean_velocity or efficiency", objective, "choose one of them")
+    over = str(next(name for name in seen.dims if name != "draw"))
+    axis, label, goal = seen[over].to_numpy(), seen["label"].to_numpy(), seen[objective].to_numpy()
+    failed = label == "failed"
+    if failed.all(axis=0).any() or failed.all(axis=1).any():
+        raise InputError("every value and every draw needs a run that is complete", "all failed", "look at status")
+    occurring, counts = np.unique(label, return_counts=True)
+    names = occurring[np.argsort(-counts, kind="stable")]
+    probability = np.stack([(label == name).mean(axis=1) for name in names])
+    goal = np.where(failed, np.nan, goal)
+    at = np.nanargmax(goal, axis=0)
+    best, best_goal = axis[at], goal[at, np.arange(goal.shape[1])]
+    chosen = int(np.argmax(np.nanmean(goal, axis=1)))
+    value, unit = dict(seen[over].attrs), seen[objective].attrs["units"]
+    about = {"units": unit, "long_name": seen[objective].attrs["long_name"]}
+    per_draw = "with the largest objective, of each draw"
+    return xr.Dataset(
+        {
+            "probability": (
+                ("label", over),
+                probability,
+                {"units": "1", "long_name": "posterior probability of the motion"},
+            ),
+            f"{objective}_quantiles": (("quantile", over), np.nanquantile(goal, QUANTILES, axis=1), about),
+            "best": ("draw", best, value | {"long_name": f"{value['long_name']} {per_draw}"}),
+            f"best_{objective}": ("draw", best_goal, about),
+            "best_quantiles": ("quantile", np.quantile(best, QUANTILES), value),
+            f"best_{objective}_quantiles": ("quantile", np.quantile(best_goal, QUANTILES), about),
+            "chosen": ((), axis[chosen], value | {"long_name": "value whose objective is largest in the mean"}),
+            f"chosen_{objective}_quantiles": ("quantile", np.nanquantile(goal[chosen], QUANTILES), about),
+        },
+        {over: (over, axis, value), "label": list(map(str, names)), "quantile": list(QUANTILES)},
+        {**seen.attrs, "objective": objective, "draws": goal.shape[1]},
+    )

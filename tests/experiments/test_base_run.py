@@ -10,8 +10,7 @@ from scipy.optimize import least_squares
 
 from capsule_id.api import fit
 from capsule_id.errors import InputError
-from capsule_id.experiments.forced_run.checks import feasibility
-from capsule_id.experiments.forced_run.drives import BaseRun, ForcedRun
+from capsule_id.experiments.forced_run.drives import BaseRun, ForcedRun, feasibility
 from capsule_id.experiments.forced_run.start_state import slides
 from capsule_id.inference.joint_fit import choose_starts
 from capsule_id.inference.target import LogPosterior

@@ -12,8 +12,7 @@ from scipy.signal import lfilter
 from capsule_id.api import fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks import LEVEL
-from capsule_id.experiments.forced_run.checks import FEWEST_PERIODS, repetition
-from capsule_id.experiments.forced_run.drives import BaseRun
+from capsule_id.experiments.forced_run.drives import FEWEST_PERIODS, BaseRun, repetition
 from capsule_id.experiments.friction_model import FrictionModel
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference import point_stage as second_fits

@@ -89,7 +89,7 @@ def test_every_kind_has_numbers_alone_as_leaves(tmp_path: Path) -> None:
 def test_another_start_or_part_of_a_run_leaves_the_run_as_it_was() -> None:
     run = make(0, samples=600)
     before = [np.copy(leaf) for leaf in jax.tree.leaves(run)]
-    assert run.restarted(0.0).moves == 0.0
+    assert run.remade(run.table, capsule_rate=0.0).moves == 0.0
     assert [part.time[0] for part in run.parts(0.3)][1:] != [run.time[0]]
     for old, new in zip(before, jax.tree.leaves(run), strict=True):
         np.testing.assert_array_equal(old, new)

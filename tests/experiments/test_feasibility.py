@@ -8,7 +8,7 @@ import pytest
 
 from capsule_id.experiments import rough_values
 from capsule_id.experiments.forced_run.declaration import MESSAGES
-from capsule_id.experiments.forced_run.feasibility import RunConditions, contact_time, feasibility, held_rod
+from capsule_id.experiments.forced_run.drives import contact_time, feasibility, held_rod
 from capsule_id.experiments.kind import default_registry
 from capsule_id.parameters import Prior
 from capsule_id.physics.drive import Excitation
@@ -105,15 +105,14 @@ def test_the_held_rod_is_a_capsule_too_heavy_to_move() -> None:
     t = simulate(CapsuleParameters(G=1e-3, **held), Excitation(4.0, 34.56), times)
     x, y = np.asarray(t.x_rel), np.asarray(t.Y1)
     force = TRUTH["k1"] * x + TRUTH["c"] * y + 18960.0 * np.maximum(x - 1e-3, 0.0)
-    largest, touches = held_rod({**TRUTH, "k2": 18960.0}, RunConditions(34.56, 4.0, 1e-3))
+    largest, touches = held_rod({**TRUTH, "k2": 18960.0}, 4.0, 34.56, 1e-3)
     assert touches
     assert largest == pytest.approx(np.abs(force).max(), rel=5e-3)
 
 
 def test_a_drive_of_hours_is_judged_by_its_start() -> None:
     """Against a step of the same load: overshoot exp(-pi zeta/sqrt(1 - zeta^2)) beyond P_d/k1, no spring in reach."""
-    far = RunConditions(1e-3, 1.0, 1.0)
-    largest, touches = held_rod({**TRUTH, "k2": 18960.0, "c": 0.5}, far)
+    largest, touches = held_rod({**TRUTH, "k2": 18960.0, "c": 0.5}, P_d=1.0, Omega=1e-3, G=1.0)
     zeta = 0.5 / (2.0 * np.sqrt(TRUTH["k1"] * TRUTH["m1"]))
     # |f| = |k1 x + c y| peaks at the overshoot but for a part of order zeta^2.
     assert largest == pytest.approx(1.0 + np.exp(-np.pi * zeta / np.sqrt(1.0 - zeta**2)), rel=0.01)

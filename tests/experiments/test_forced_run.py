@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from capsule_id.experiments.forced_run.declaration import SETTLING_PERIODS
 from capsule_id.experiments.forced_run.drives import ForcedRun
-from capsule_id.experiments.forced_run.experiment import SETTLING_PERIODS
 from capsule_id.experiments.forced_run.start_state import rough_start
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.simulation import simulate
@@ -84,7 +84,7 @@ def test_runs_of_both_kinds_of_start_are_one_group_and_add_up() -> None:
     tables = [table(0), table(1)]
     rig = bench.rig(*tables)
     runs = [ForcedRun(own, rig) for own in tables]
-    assert [run.about.start for run in runs] == ["moving", "stuck"]
+    assert [run.moves for run in runs] == [1.0, 0.0]
     target = LogPosterior(rig, runs)
     assert len(target.groups) == 1
     rng = np.random.default_rng(0)
@@ -113,7 +113,7 @@ def test_a_settled_run_starts_on_the_motion_that_it_settles_on_from_rest() -> No
 def test_the_record_tells_where_the_fit_may_start(number: int) -> None:
     run, truth = recorded()[number], recorded()[number].truth
     rough = rough_start(run.time, run.channels, truth.Omega)
-    assert rough.kind == ("moving" if truth.Y2 else "stuck")
+    assert bool(rough.capsule_rate) == bool(truth.Y2)
     assert abs(np.angle(np.exp(1j * (rough.phase - truth.phase)))) < 1e-3
     assert rough.amplitude == pytest.approx(truth.current_amplitude, rel=1e-3)
     assert rough.x_rel - truth.x_rel == pytest.approx(truth.offsets["x_rel"], abs=4e-5)

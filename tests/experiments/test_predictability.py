@@ -5,8 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from capsule_id.experiments.forced_run import experiment as predictability
-from capsule_id.experiments.forced_run.checks import check_predictable
-from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.forced_run.drives import ForcedRun, check_predictable
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, growth
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit

@@ -50,7 +50,7 @@ def test_sums_over_groups_give_the_density_of_the_trials(lone: tuple[int, ...]) 
     distance, at_nodes = rng.normal(size=10), 0.4 * rng.normal(size=(4, len(NODES)))
     at_nodes = np.asarray(sessions.responses(at_nodes.ravel()[: len(sessions.case)]))
     groups, discrepancy = TrialGroups(distance, sessions), np.array([0.3, 0.8])
-    assert tuple(map(len, groups.lone)) == (len(lone) % 2 if len(lone) != 2 else 2, 2 * (len(lone) == 3))
+    assert tuple(map(len, groups.members[1:])) == (len(lone) % 2 if len(lone) != 2 else 2, 2 * (len(lone) == 3))
     X2 = [make_interp_spline(NODES, x, k=1)(z) if k in lone else x[[MIDDLE]] for k, x in enumerate(at_nodes)]
     expected = [
         [
@@ -216,7 +216,7 @@ def test_runs_between_the_outer_ones_matter(tmp_path: Path) -> None:
     (e,) = cast(list[Progression], make_experiments(read_rig(tmp_path / "rig")))
     theta, z, fine = {**THETA, "session_sd": 0.2}, np.linspace(-5.0, 5.0, 41), np.linspace(-5.0, 5.0, 401)
     assert e.sessions.symbols == ()
-    runs = e.displacements_of_draws([theta], 0.2 * np.tile(z, 12)[None], np.repeat(e.settings, 41, axis=0))
+    runs = np.asarray(e.displacements(theta, 0.2 * np.tile(z, 12), np.repeat(e.settings, 41, axis=0)))
     X2 = np.asarray(e.responses(theta))
     straight = X2[:, MIDDLE, None] + (X2[:, [3]] - X2[:, [1]]) / (NODES[3] - NODES[1]) * NODES
     expected = [

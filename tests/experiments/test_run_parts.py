@@ -89,8 +89,9 @@ def test_a_delay_is_integrated_out_and_found() -> None:
 def test_a_creeping_start_is_told_from_rest_by_the_whole_record() -> None:
     moving = theta(0)
     assert abs(moving["capsule_start"]) > 1e-3  # this run starts in motion
-    run = make(0, samples=600).restarted(0.0)
-    assert run.about.start == "stuck"
+    run = make(0, samples=600)
+    run = run.remade(run.table, capsule_rate=0.0)
+    assert not run.moves
     wrong = moving | {"y_start": moving["y_start"] + moving["capsule_start"], "capsule_start": 0.0}
     found = better_start(run, wrong) or {}
     # On a grid of speeds, each a half above the one before.
@@ -99,7 +100,7 @@ def test_a_creeping_start_is_told_from_rest_by_the_whole_record() -> None:
 
 
 def test_a_start_that_fits_stands() -> None:
-    assert better_start(make(0, samples=600).restarted(theta(0)["capsule_start"]), theta(0)) is None
-    stuck = make(2, samples=600)
-    assert stuck.about.start == "stuck"
+    moving, stuck = (make(number, samples=600) for number in (0, 2))
+    assert better_start(moving.remade(moving.table, capsule_rate=theta(0)["capsule_start"]), theta(0)) is None
+    assert not stuck.moves
     assert better_start(stuck, theta(2)) is None

@@ -9,8 +9,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.forced_run.checks import predicted_motion
-from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.forced_run.drives import ForcedRun, predicted_motion
 from capsule_id.records.motion import measured_motion
 from capsule_id.synthetic import truth_beside
 

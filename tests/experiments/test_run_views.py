@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from capsule_id.experiments.forced_run.checks import PORTRAIT_ORDER, _portrait
+from capsule_id.experiments.forced_run.drives import PORTRAIT_ORDER, _portrait
 from capsule_id.rig.filters import choose_window, sampling_step, window_samples
 from tests.forced_runs import make, theta
 

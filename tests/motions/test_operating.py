@@ -5,8 +5,8 @@ import pytest
 import xarray as xr
 
 from capsule_id.errors import InputError
-from capsule_id.motions.operating import bands, draws_diagram
 from capsule_id.motions.response import Settling, response
+from capsule_id.motions.sweep import bands, draws_diagram
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.model import CapsuleParameters
 

@@ -4,12 +4,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, make_dataclass
 from functools import partial
 from pkgutil import resolve_name
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.kind import Estimate, Kind, made_by
+from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.lint import lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, drive_power, phasor
@@ -89,10 +89,6 @@ def lacks(column: str, fewest: int = 0) -> Callable[[Any, Mapping[str, Column]],
     return lambda settings, columns: column not in columns or len(columns) < fewest
 
 
-_IS_SETTLED = DriveRule(
-    (BASE,), lambda settings, columns: settings.start == "settled", "start",
-    'start = "settled" needs a harmonic force', 'drive = "{drive}"', 'write start = "auto"',
-)  # fmt: skip
 #: The rules on the drive of a forced run, in the order in which they are applied.
 DRIVE_RULES = (
     DriveRule(
@@ -105,7 +101,6 @@ DRIVE_RULES = (
         "a run with a prescribed rod has x_capsule, x_rel or both, and no other channel", "{columns}", "remove {found}",
     ),
     DriveRule((BASE,), stated("P_d"), "P_d", 'drive = "base" has no force P_d', "P_d", "remove P_d", of_key=True),
-    _IS_SETTLED,
     DriveRule(
         (BASE,), _uneven_base, "", "the frequency of a base sampled unevenly must be stated", "{found}",
         'add f = {{ value = ..., unit = "Hz" }}',
@@ -126,7 +121,10 @@ DRIVE_RULES = (
     DriveRule(
         (PULSES, RECORDED), stated("P_d"), "P_d", 'drive = "{drive}" has no amplitude P_d', "P_d", "remove P_d", of_key=True
     ),
-    _IS_SETTLED._replace(drives=(PULSES, RECORDED)),
+    DriveRule(
+        (BASE, PULSES, RECORDED), lambda settings, columns: settings.start == "settled", "start",
+        'start = "settled" needs a harmonic force', 'drive = "{drive}"', 'write start = "auto"',
+    ),
     DriveRule(
         (RECORDED,), lacks("current", 3), "drive",
         'drive = "recorded" needs the column current and another channel', "{columns}", "add it",
@@ -172,8 +170,13 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     del rig
     used = slice(0, len(table.rows))
     yield from lint_times(table, used)
-    period = 2.0 * np.pi / stated_Omega(table)
-    faults = list(_time_scale(table, period))
+    time, period = table["time"], 2.0 * np.pi / stated_Omega(table)
+    faults = list[Finding]()
+    samples, periods = period / median_step(time), float(time[-1] - time[0]) / period
+    # The record holds no period of the stated frequency, or its sampling cannot follow it.
+    if samples < FEWEST_SAMPLES or periods < 1.0:
+        facts = {"file": table.file, "periods": periods, "samples": samples}
+        faults.append(Finding("runs.time_scale", "fail", facts, table.label))
     for name in table.columns:
         # A capsule may rest at an extreme position, which is no clipping.
         if name not in ("time", "x_capsule"):
@@ -189,15 +192,6 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if drive is not None and drive.disagrees:
         facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd}
         yield Finding("runs.frequency", "warn", facts, table.label)
-
-
-def _time_scale(table: Table[Any], period: float) -> Iterable[Finding]:
-    """Report a stated frequency of which the record holds no period, or which its sampling cannot follow."""
-    time = table["time"]
-    samples, periods = period / median_step(time), float(time[-1] - time[0]) / period
-    if samples < FEWEST_SAMPLES or periods < 1.0:
-        facts = {"file": table.file, "periods": periods, "samples": samples}
-        yield Finding("runs.time_scale", "fail", facts, table.label)
 
 
 def _columns(table: Table[Any]) -> Iterable[Finding]:
@@ -299,6 +293,8 @@ ChannelSettings: Any = make_dataclass(
     frozen=True,
     kw_only=True,
 )
+#: Excitation periods from rest after which the motion counts as periodic (start = "settled").
+SETTLING_PERIODS = 40
 #: Stiffness of the hard spring of the paper's Fig. 10, N/m; it has no static test.
 RUN_SPRINGS = {"hard": 59410.0}
 
@@ -329,31 +325,7 @@ class RunSettings(ChannelSettings):
     @property
     def angular_frequency(self) -> float:
         """Stated frequency of the drive, rad/s; the reader ensures that it is stated."""
-        if self.Omega is not None:
-            return self.Omega
-        assert self.f is not None, "a forced run has Omega or f"
-        return 2.0 * np.pi * self.f
-
-
-def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[Finding]:
-    """Report quantities that the run cannot measure, at rough values."""
-    from capsule_id.experiments.forced_run.feasibility import feasibility
-    from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
-
-    settings = table.settings
-    if settings.drive != "harmonic" or settings.ground:
-        return []
-    names = {symbol: symbol for symbol in ("k1", "c", "mu") + (("K",) if settings.P_d is None else ())}
-    names |= {} if settings.spring is None else {"k2": f"k2[{settings.spring}]"}
-    values = {symbol: estimate(name) for symbol, name in names.items()}
-    guessed = [names[symbol] for symbol, (_, measured) in values.items() if not measured]
-    theta = {"m1": rig.mass("m1"), "m2": rig.mass("m2"), "g": rig.g.value}
-    theta |= {symbol: value for symbol, (value, _) in values.items()}
-    normal = {} if settings.normal_force is None else {NORMAL_FORCE: settings.normal_force}
-    findings = feasibility(table, theta, float(EQUATION_1.force({**theta, **normal}).forward(0.0)))
-    if findings and guessed:
-        findings.append(Finding("runs.rough", "warn", {"names": ", ".join(guessed)}, table.label))
-    return findings
+        return self.Omega or 2.0 * np.pi * cast(float, self.f)
 
 
 def _second_fit(facts: Facts) -> str:
@@ -553,7 +525,7 @@ KIND = Kind(
     messages=MESSAGES,
     bench=False,
     lint=(lint_run,),
-    lint_rig=_lint_feasibility,
+    lint_rig=lambda *of_table: resolve_name(f"{PLACE}.drives:lint_feasibility")(*of_table),
     describe=describe_run,
     twin=lambda values, rng, seed: resolve_name(f"{PLACE}.twin:measure")(values, seed),
     truth={f"k2[{name}]": k2 for name, k2 in RUN_SPRINGS.items()},

@@ -12,7 +12,13 @@ import numpy as np
 from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, stated_rate, stretch
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters, stated_starts
 from capsule_id.experiments.checks import autocorrelation
-from capsule_id.experiments.forced_run.declaration import CAPSULE_START, CORRELATION, CURRENT_AMPLITUDE, NOISE
+from capsule_id.experiments.forced_run.declaration import (
+    CAPSULE_START,
+    CORRELATION,
+    CURRENT_AMPLITUDE,
+    NOISE,
+    SETTLING_PERIODS,
+)
 from capsule_id.experiments.forced_run.start_state import (
     AboutRun,
     RunStart,
@@ -86,8 +92,6 @@ class Channel(eqx.Module):
 # out too where their sd is stated. X2 = 0 at the first sample, because the offset of x_capsule is free.
 
 
-#: Excitation periods from rest after which the motion counts as periodic (start = "settled").
-SETTLING_PERIODS = 40
 #: Default prior of a channel's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
 #: Default prior of the current's amplitude: log-normal about half its range.
@@ -187,9 +191,9 @@ class CapsuleRun(CapsuleForward):
         rough = self.first_state(table)
         rough = rough if capsule_rate is None else replace(rough, capsule_rate=capsule_rate)
         is_open = settings.start == "auto" or not leads
-        start = rough.kind if is_open else settings.start
-        self.settled, self.moves = start == "settled", float(start == "moving")
-        self.about = AboutRun(table, rig, (), part_of or table.label, leads, start, is_open, rough)
+        self.settled = settings.start == "settled" and not is_open
+        self.moves = float(rough.capsule_rate != 0.0 if is_open else settings.start == "moving")
+        self.about = AboutRun(table, rig, (), part_of or table.label, leads, is_open, rough)
         self.about = replace(self.about, parameters=tuple(self._sampled()))
 
     def read_drive(self, table: Table, rig: Rig) -> None:
@@ -226,18 +230,15 @@ class CapsuleRun(CapsuleForward):
         return [*rows, *(CORRELATION[name].named(whole) for name in self.names if self.coloured)]
 
     def starts(self) -> dict[str, Start]:
-        """Starts of the nuisances from the record; other parameters start at bench estimates or prior centres."""
-        rough, of = self.rough, self.label
-        starts = self._starts_of_record() if self.about.leads else {}
-        starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
-        starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * self.Omega * rough.length)
-        starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * self.Omega * rough.length)
-        known = {row.name for row in self.parameters}
-        return {name: start for name, start in starts.items() if name in known}
-
-    def _starts_of_record(self) -> dict[str, Start]:
+        """Starts of the nuisances from the record, sampled or not; other parameters start at bench estimates or priors."""
         rough, of, settings = self.rough, self.about.record, self.table.settings
-        return {
+        state = {"x_start": rough.x_rel, "y_start": rough.rate, "capsule_start": rough.capsule_rate}
+        spreads = 0.03 * rough.length * np.array([1.0, self.Omega, self.Omega])
+        pairs = zip(state.items(), spreads.tolist(), strict=True)
+        starts = {f"{symbol}[{self.label}]": Start(value, spread) for (symbol, value), spread in pairs}
+        if not self.about.leads:
+            return starts
+        return starts | {
             f"phase[{of}]": Start(rough.phase, 0.02),
             **stated_starts(of, G=settings.gap, P_d=settings.P_d),
             f"I_d[{of}]": Start(rough.amplitude, 0.005),
@@ -256,15 +257,13 @@ class CapsuleRun(CapsuleForward):
     def parts(self, seconds: float) -> "tuple[CapsuleRun, ...]":
         """Divide the record into parts of about ``seconds``; return the run itself if it is not longer."""
         tables = parts_of(self.table, seconds)
-        made = (self._remade(table, None, leads=self.about.leads and i == 0) for i, table in enumerate(tables))
-        return tuple(made) if len(tables) > 1 else (self,)
-
-    def restarted(self, capsule_rate: float) -> "CapsuleRun":
-        """Return the same record with this capsule speed at the first sample, m/s; 0: stuck."""
-        return self._remade(self.table, capsule_rate)
+        own = (
+            self.remade(table, capsule_rate=None, leads=self.about.leads and i == 0) for i, table in enumerate(tables)
+        )
+        return tuple(own) if len(tables) > 1 else (self,)
 
     def with_friction(self, friction: FrictionModel) -> "CapsuleRun":
-        return self._remade(self.table, self.rough.capsule_rate, friction=friction)
+        return self.remade(self.table, friction=friction)
 
     def with_coloured_noise(self, theta: ValuesBySymbol) -> "tuple[CapsuleRun, dict[str, float]] | None":
         if self.coloured or self.table.settings.noise is not None:
@@ -274,11 +273,12 @@ class CapsuleRun(CapsuleForward):
             rho = float(np.clip(autocorrelation(residuals, 1)[0], 0.0, LARGEST_CORRELATION))
             values[f"ar1_{name}[{self.about.record}]"] = float(np.arctanh(rho))
             values[f"noise_{name}[{self.about.record}]"] = theta[f"noise_{name}"] * float(np.sqrt(1.0 - rho**2))
-        return self._remade(self.table, self.rough.capsule_rate, coloured=True), values
+        return self.remade(self.table, coloured=True), values
 
-    def _remade(self, table: Table, capsule_rate: float | None, **changed: Any) -> "CapsuleRun":
-        about, own = self.about, {"friction": self.friction, "coloured": self.coloured, **changed}
-        own = {"part_of": about.record, "leads": about.leads, "capsule_rate": capsule_rate, **own}
+    def remade(self, table: Table, **changed: Any) -> "CapsuleRun":
+        """Return a run of ``table``, the record or a part of it, with other arguments of the constructor."""
+        own = {"friction": self.friction, "part_of": self.about.record, "leads": self.about.leads}
+        own |= {"capsule_rate": self.rough.capsule_rate, "coloured": self.coloured, **changed}
         return type(self)(table, self.rig, **own).with_smoothing(self.smoothing)
 
     # -- what the record is -----------------------------------------------------------------------------------------
@@ -387,9 +387,8 @@ class CapsuleRun(CapsuleForward):
         return [seen[name]() for name in self.names]
 
     def current_of(self, theta: ValuesBySymbol, xp: ModuleType) -> Any:
-        """Current at the samples, A."""
+        """Current at the samples, A, of a harmonic drive."""
         e, I_d = before_samples((self.capsule(theta)[1], theta["I_d"]), xp)
-        assert isinstance(e, Excitation), "a current belongs to a harmonic drive"
         return I_d * e.cosine(self.true_time(theta))
 
     def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
@@ -427,7 +426,7 @@ class CapsuleRun(CapsuleForward):
         better = better_start(self, theta) if may_change else None
         if better is None:
             return None
-        restarted = self.restarted(better["capsule_start"])
+        restarted = self.remade(self.table, capsule_rate=better["capsule_start"])
         # A prescribed rod has no initial speed to sample, and a capsule at rest none either.
         sampled = {row.symbol for row in restarted.parameters}
         return restarted, {f"{symbol}[{self.label}]": value for symbol, value in better.items() if symbol in sampled}
@@ -490,7 +489,7 @@ def better_start(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float] | N
     capsule_start is 0 where it does not differ significantly from rest. For every trial speed, Gauss–Newton estimates
     position and speed of the rod again, because they compensate much of the change. Other values are as in ``theta``.
     """
-    moving, own = run.restarted(1.0).with_smoothing(None), float(theta.get("capsule_start", 0.0))
+    moving, own = run.remade(run.table, capsule_rate=1.0).with_smoothing(None), float(theta.get("capsule_start", 0.0))
     speeds = np.append(TRIAL_SPEEDS, own)
     rod = np.full((2, len(speeds)), [[theta["x_start"]], [theta.get("y_start", 0.0) + own]])
     offsets = np.array([[0.0, 0.0], [DIFFERENCE_STEPS[0], 0.0], [0.0, DIFFERENCE_STEPS[1]]])

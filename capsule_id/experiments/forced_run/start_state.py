@@ -117,11 +117,6 @@ class RunStart:
     phase: float
     noise: Mapping[str, float]
 
-    @property
-    def kind(self) -> str:
-        """Kind of the initial state."""
-        return "moving" if self.capsule_rate else "stuck"
-
 
 @dataclass(frozen=True)
 class AboutRun(About):
@@ -131,14 +126,12 @@ class AboutRun(About):
     ----------
     record : label of the whole record
     leads : whether the run is a whole record, or the first part of one
-    start : kind of initial state
     start_is_open : whether no kind of initial state is stated
     rough : state and drive at the first sample, estimated from the record (the speed by the model, where available)
     """
 
     record: str = field(compare=False)
     leads: bool = field(compare=False)
-    start: str = field(compare=False)
     start_is_open: bool = field(compare=False)
     rough: RunStart = field(compare=False)
 
@@ -167,10 +160,8 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
     elif "acceleration_rod" in channels:
         # Contacts are short spikes, and quartiles are robust against them.
         length = float(np.subtract(*np.quantile(channels["acceleration_rod"], [0.75, 0.25]))) / Omega**2
-    elif "x_capsule" in channels:
-        length = max(float(np.ptp(channels["x_capsule"])), 1e-4)
     else:
-        length = 1e-3
+        length = max(float(np.ptp(channels.get("x_capsule", 0.0))), 1e-4)
     capsule_rate = 0.0
     if "x_capsule" in channels:
         (_, slope), factor = _polynomial(time, channels["x_capsule"], LINE_SAMPLES, 1)
@@ -207,8 +198,13 @@ def parts_of(table: Table, seconds: float) -> list[Table]:
     if count == 1:
         return [table]
     edges = _edges(table, count)
-    pieces = (slice(*edges[i : i + 2]) for i in range(count))
-    return [_part(table, i, rows) for i, rows in enumerate(pieces, start=1)]
+    parts = []
+    for i in range(count):
+        rows = slice(*edges[i : i + 2])
+        columns = {name: replace(column, values=column.values[rows]) for name, column in table.columns.items()}
+        label = f"{table.label}{PART_MARK}{i + 1}"
+        parts.append(replace(table, label=label, columns=columns, rows=table.rows[rows]))
+    return parts
 
 
 def _edges(table: Table, count: int) -> list[int]:
@@ -242,8 +238,3 @@ def _roughness(table: Table) -> np.ndarray:
             total[: len(miss)] += miss / max(float(np.median(miss)), 1e-300)
             total[len(miss) :] = np.inf
     return total
-
-
-def _part(table: Table, index: int, rows: slice) -> Table:
-    columns = {name: replace(column, values=column.values[rows]) for name, column in table.columns.items()}
-    return replace(table, label=f"{table.label}{PART_MARK}{index}", columns=columns, rows=table.rows[rows])

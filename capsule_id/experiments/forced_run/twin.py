@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.forced_run.declaration import RUN_SPRINGS
+from capsule_id.experiments.forced_run.declaration import RUN_SPRINGS, SETTLING_PERIODS
 from capsule_id.experiments.kind import Twin, TwinTable, Values
 from capsule_id.parameters import QUANTILE_975
 from capsule_id.physics.drive import Excitation
@@ -42,8 +42,6 @@ RUNS = (
 )
 #: Factor of the prior of springs without a static test, dimensionless.
 SPRING_FACTOR = 1.5
-#: Excitation periods from rest before the record starts; the record starts at a random phase.
-SETTLED = 40
 #: Noise level of each channel, SI (m, m, m/s^2, A).
 NOISE_SD = {"x_rel": 10e-6, "x_capsule": 5e-6, "acceleration_rod": 1.0, "current": 5e-3}
 #: Standard deviation of the channels' zero errors, SI. x_capsule has none, because it is zero at the first sample.
@@ -109,7 +107,8 @@ def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, 
         If the model cannot complete a run with these parameters.
     """
     generators = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(len(runs))]
-    cuts = np.array([SETTLED + rng.uniform() for rng in generators])
+    # A record starts at a random phase of its settled motion.
+    cuts = np.array([SETTLING_PERIODS + rng.uniform() for rng in generators])
     T = np.array([2.0 * np.pi / run.Omega for run in runs])
     time = np.arange(max(run.samples for run in runs)) * np.array([[run.step] for run in runs])
     start = (cuts * T)[:, None]
@@ -156,10 +155,19 @@ def _measure(
         name: values + offsets.get(name, 0.0) + NOISE_SD[name] * rng.standard_normal(len(time))
         for name, values in exact.items()
     }
-    drive = {"spring": run.spring, "G": run.G, "P_d": run.P_d, "Omega": run.Omega, "phase": phase}
-    first = {"x_rel": float(x_rel[0]), "Y1": float(Y1[0]), "Y2": float(Y2[0])}
-    errors = {"offsets": offsets, "noise_sd": dict(NOISE_SD)}
-    truth = SimpleNamespace(**drive, current_amplitude=amplitude, **first, **errors)
+    truth = SimpleNamespace(
+        spring=run.spring,
+        G=run.G,
+        P_d=run.P_d,
+        Omega=run.Omega,
+        phase=phase,
+        current_amplitude=amplitude,
+        x_rel=float(x_rel[0]),
+        Y1=float(Y1[0]),
+        Y2=float(Y2[0]),
+        offsets=offsets,
+        noise_sd=dict(NOISE_SD),
+    )
     return SyntheticRun(time, channels, stated_gap, truth)
 
 
@@ -168,8 +176,8 @@ def spring_priors(parameters: Mapping[str, float], seed: int) -> tuple[str, ...]
     spread = np.log(SPRING_FACTOR) / QUANTILE_975
     # A key that no run uses makes the priors independent of the number of runs.
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**20,)))
-    lines = []
-    for spring in RUN_SPRINGS:
-        median = parameters[f"k2[{spring}]"] * np.exp(spread * rng.standard_normal())
-        lines.append(f'"k2[{spring}]" = {{ median = {1e-3 * median:.3g}, factor = {SPRING_FACTOR:g}, unit = "kN/m" }}')
-    return tuple(lines)
+    scattered = {f"k2[{spring}]": np.exp(spread * rng.standard_normal()) for spring in RUN_SPRINGS}
+    return tuple(
+        f'"{name}" = {{ median = {1e-3 * parameters[name] * factor:.3g}, factor = {SPRING_FACTOR:g}, unit = "kN/m" }}'
+        for name, factor in scattered.items()
+    )

@@ -1,6 +1,6 @@
 """Progressions: columns, settings, sessions, rules, template and texts."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -89,15 +89,12 @@ class ProgressionSettings(GroundSettings):
     tails: Literal["normal", "heavy"] = "normal"
 
 
-def _amplitudes(own: str) -> Callable[[Any, Mapping[str, Column]], str]:
-    """Finds the stated amplitudes of a drive, where there is not exactly one; ``own`` : name of the amplitude."""
-
-    def found(settings: ProgressionSettings, columns: Mapping[str, Column]) -> str:
-        stated = [name for name in (own, "current") if name in columns]
-        stated += [f"the setting {own}"] if getattr(settings, own) is not None else []
-        return "" if len(stated) == 1 else " and ".join(stated) or "none"
-
-    return found
+def _amplitudes(settings: ProgressionSettings, columns: Mapping[str, Column]) -> str:
+    """The stated amplitudes of the drive, where there is not exactly one."""
+    own = AMPLITUDE[settings.drive]
+    stated = [name for name in (own, "current") if name in columns]
+    stated += [f"the setting {own}"] if getattr(settings, own) is not None else []
+    return "" if len(stated) == 1 else " and ".join(stated) or "none"
 
 
 def _crowded(settings: ProgressionSettings, columns: Mapping[str, Column]) -> str:
@@ -121,7 +118,7 @@ DRIVE_RULES = (
     DriveRule(("harmonic",), stated("lag"), "lag", "only pulses have a lag", "lag", "remove lag", of_key=True),
     *(
         DriveRule(
-            (drive,), _amplitudes(own), "",
+            (drive,), _amplitudes, "",
             f"a progression must have one amplitude: a column {own} or current, or the setting {own}", "{found}",
             f'state {own} = {{{{ value = ..., sd = ..., unit = "N" }}}} and nothing else',
         )

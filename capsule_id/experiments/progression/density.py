@@ -187,8 +187,7 @@ class Emulator(eqx.Module):
         positive : inputs by symbol, and whether each is positive
         """
         self.symbols, self.positive = tuple(positive), tuple(positive.values())
-        x = np.array([[draw[symbol] for symbol in self.symbols] for draw in draws], dtype=float)
-        x = np.where(self.positive, np.log(np.where(self.positive, x, 1.0)), x)
+        x = self._inputs({symbol: np.array([draw[symbol] for draw in draws], float) for symbol in positive}, np).T
         known = np.all(np.isfinite(motions), axis=1)
         x, y = x[known], motions[known]
         self.centre, self.scale = np.mean(x, axis=0), np.std(x, axis=0)
@@ -206,10 +205,14 @@ class Emulator(eqx.Module):
 
     def __call__(self, theta: Mapping[str, Any]) -> Any:
         """Motions (k,) at parameters by symbol, () each."""
-        values = [theta[symbol] for symbol in self.symbols]
-        pairs = zip(values, self.positive, strict=True)
-        x = jnp.stack([jnp.log(value) if positive else jnp.asarray(value) for value, positive in pairs])
-        return (self._features(x[None], jnp) @ self.weights)[0]
+        return (self._features(self._inputs(theta, jnp)[None], jnp) @ self.weights)[0]
+
+    def _inputs(self, theta: Mapping[str, Any], xp: Any) -> Any:
+        """(p, ...) of parameters by symbol, (...) each."""
+        pairs = zip(self.symbols, self.positive, strict=True)
+        return xp.stack(
+            [xp.log(theta[symbol]) if positive else xp.asarray(theta[symbol]) for symbol, positive in pairs]
+        )
 
     def _features(self, x: Any, xp: Any) -> Any:
         """(n, features + 1 + p) of inputs (n, p)."""
@@ -287,10 +290,10 @@ class RunEmulator(eqx.Module):
 #: Nodes of the discrepancy of a setting with several sessions that are integrated out. Errors are below 0.01 where it is
 #: up to 3 sds of the mean of a case, and reach 2 at 10 sds where a motion is flat on one side of a kink and steep beyond.
 DISCREPANCIES = 13
+#: Groups of cases: of a known session, and of sessions that are integrated out, see ``TrialGroups.members``.
+KNOWN, LONE, SHARED = range(3)
 #: Within these z a line may explain the readings, for the variance of a trial that depends on its displacement.
 FARTHEST_Z = 3.0
-#: Smallest probability that is computed as such; the logarithm of a smaller one is that of the tail of a normal density.
-LEAST = 1e-300
 
 
 class TrialGroups(eqx.Module):
@@ -304,9 +307,9 @@ class TrialGroups(eqx.Module):
     case : (k,) case of the trials, as in ``Sessions``; an alternative has all cases of its setting
     sums : (5, k) weighted mean, m, number of trials, sum of their weights, sum of squares, m^2, sum of the logarithms of
         ``variance``
-    known, filled : (alternatives, g) index of what is known of an alternative, and 1 where there is one; else any index
-    lone : index of the others: of those alone in their setting, apart from known ones, and of those that share it
-    of_alternative : for both, (k, alternatives) 1 where it belongs to an alternative
+    members : index of those whose session is known, of the others that are alone in their setting, apart from known
+        ones, and of those that share it
+    of_alternative : for each of ``members``, (k, alternatives) 1 where it belongs to an alternative
     """
 
     variance: np.ndarray
@@ -314,10 +317,8 @@ class TrialGroups(eqx.Module):
     setting: np.ndarray
     case: np.ndarray
     sums: np.ndarray
-    known: np.ndarray
-    filled: np.ndarray
-    lone: tuple[np.ndarray, np.ndarray]
-    of_alternative: tuple[np.ndarray, np.ndarray]
+    members: tuple[np.ndarray, ...]
+    of_alternative: tuple[np.ndarray, ...]
 
     def __init__(self, distance: Float[np.ndarray, " n"], sessions: Sessions, heavy: bool = False) -> None:
         """Group trials by their distance, m."""
@@ -331,15 +332,9 @@ class TrialGroups(eqx.Module):
         spread = np.sum(rows * weight * (distance - mean[:, None]) ** 2, axis=1)
         self.sums = np.stack([mean, np.sum(rows, axis=1), count, spread, measure])
         alone, shared = sessions.alone[self.case], sessions.shared[self.case]
+        self.members = tuple(np.flatnonzero(own) for own in (alone == 0.0, alone > shared, shared))
         each = np.arange(len(self.setting))
-        known = [np.flatnonzero((alternative == b) & (alone == 0.0)) for b in each]
-        self.filled = 1.0 * (np.arange(max(1, *map(len, known))) < np.array(list(map(len, known)))[:, None])
-        first = np.searchsorted(alternative, each)
-        self.known = np.repeat(first[:, None], self.filled.shape[1], axis=1)
-        self.known[self.filled > 0.0] = np.concatenate(known)
-        self.lone = np.flatnonzero(alone > shared), np.flatnonzero(shared)
-        lone, sharing = (1.0 * (alternative[own][:, None] == each) for own in self.lone)
-        self.of_alternative = lone, sharing
+        self.of_alternative = tuple(1.0 * (alternative[own][:, None] == each) for own in self.members)
 
 
 @dataclass(frozen=True)
@@ -375,23 +370,21 @@ class TrialMisfit:
 
     def of_alternatives(self, scatter: Any, xp: ModuleType = jnp) -> Any:
         """(scatter, alternatives) density of the trials and prior probability of each, at ``scatter`` (scatter,), m."""
-        groups, flat = self.groups, scatter.reshape(-1, 1, 1)
-        # Axes: scatter, alternative, case.
-        X2, y, trials, count, spread, measure = self._cases(groups.known, xp)
-        v = self.reading_variance + (self.trial_scatter * X2[None, ..., MIDDLE]) ** 2 + flat**2
-        filled = xp.asarray(groups.filled)
-        weight, y = (filled * count)[None] / v, (y - X2[..., MIDDLE])[None]
-        inside = (
-            (filled * trials)[None] * (LOG_2PI + xp.log(v)) + (filled * spread)[None] / v + (filled * measure)[None]
-        )
+        groups, flat = self.groups, scatter.reshape(-1, 1)
+        # Axes: scatter and case, then scatter and alternative.
+        X2, y, trials, count, spread, measure, owner = self._cases(KNOWN, xp)
+        v = self.reading_variance + (self.trial_scatter * X2[None, :, MIDDLE]) ** 2 + flat**2
+        weight, y = count[None] / v, (y - X2[:, MIDDLE])[None]
+        inside = trials[None] * (LOG_2PI + xp.log(v)) + spread[None] / v + measure[None] + weight * y**2
         # What the discrepancy explains of the trials of known friction, and its normal density given these.
         of_setting = xp.asarray(groups.setting).astype(int)
-        prior, moment = (xp.asarray(self.discrepancy)[of_setting] ** 2)[None], xp.sum(weight * y, axis=2)
-        gain = 1.0 + prior * xp.sum(weight, axis=2)
+        prior, moment = (xp.asarray(self.discrepancy)[of_setting] ** 2)[None], (weight * y) @ owner
+        gain = 1.0 + prior * (weight @ owner)
         variance = prior / gain
-        density = -0.5 * (xp.sum(inside + weight * y**2, axis=2) - variance * moment**2 + xp.log(gain))
-        for shared in np.flatnonzero([own.shape[0] > 0 for own in groups.lone]):
-            density = density + self._of_lone_sessions(int(shared), flat, (variance * moment, variance), xp)
+        density = -0.5 * (inside @ owner - variance * moment**2 + xp.log(gain))
+        for member in (LONE, SHARED):
+            if len(groups.members[member]):
+                density = density + self._of_lone_sessions(member, flat[..., None], (variance * moment, variance), xp)
         return density + xp.asarray(groups.log_share)[None]
 
     def linear(self, distance: np.ndarray, sessions: Sessions, scatter: Any, xp: ModuleType = jnp) -> Misfit:
@@ -447,25 +440,27 @@ class TrialMisfit:
         found = xp.where(inside, start, expected), xp.where(inside, slope, 0.0), expected
         return tuple(xp.take_along_axis(x, best, axis=1)[:, 0] for x in found)
 
-    def _cases(self, index: Any, xp: ModuleType) -> tuple[Any, ...]:
-        """``X2`` (..., nodes), mean, number, sum of weights, spread and measure of ``index`` (...)."""
-        index = xp.asarray(index).astype(int)  # The log-posterior stores all numbers of experiments as floats.
-        return self.X2[xp.asarray(self.groups.case).astype(int)[index]], *xp.asarray(self.groups.sums)[:, index]
+    def _cases(self, member: int, xp: ModuleType) -> tuple[Any, ...]:
+        """``X2`` (k, nodes), mean, number, sum of weights, spread, measure (k,) and alternatives of a group of cases."""
+        # The log-posterior stores all numbers of experiments as floats.
+        index, case = (xp.asarray(x).astype(int) for x in (self.groups.members[member], self.groups.case))
+        owner = xp.asarray(self.groups.of_alternative[member])
+        return self.X2[case[index]], *xp.asarray(self.groups.sums)[:, index], owner
 
-    def _of_lone_sessions(self, shared: int, scatter: Any, discrepancy: tuple[Any, Any], xp: ModuleType) -> Any:
+    def _of_lone_sessions(self, member: int, scatter: Any, discrepancy: tuple[Any, Any], xp: ModuleType) -> Any:
         """(scatter, alternatives) density of the trials whose z is integrated out.
 
         The variance of a trial is taken where its line is nearest to the mean of the trials.
 
         Parameters
         ----------
-        shared : 0 for cases that have a setting for themselves, 1 for those that share it
+        member : ``LONE`` for cases that have a setting for themselves, ``SHARED`` for those that share it
         scatter : (scatter, 1, 1) m
         discrepancy : (scatter, alternatives) its mean, m, and variance, m^2, given the trials of known friction
         """
-        special, owner = scipy_special if xp is np else jax_special, self.groups.of_alternative[shared]
+        special, shared = scipy_special if xp is np else jax_special, member == SHARED
         nodes, chosen = (NODES, slice(None)) if shared else (NODES[INNER], INNER)
-        X2, y, trials, count, spread, measure = self._cases(self.groups.lone[shared], xp)
+        X2, y, trials, count, spread, measure, owner = self._cases(member, xp)
         start, slope = lines(X2[:, chosen], nodes, xp)
         low, high = (start + slope * np.clip(z, -FARTHEST_Z, FARTHEST_Z)[None] for z in edges(nodes))
         nearest = xp.clip(y[:, None], xp.minimum(low, high), xp.maximum(low, high))
@@ -500,8 +495,7 @@ class TrialMisfit:
 
         The nodes ``at`` lie about a normal approximation: each motion is taken as linear between the inner runs.
         """
-        owner = self.groups.of_alternative[1]
-        _, y, _, count, *_ = self._cases(self.groups.lone[1], xp)
+        _, y, _, count, *_, owner = self._cases(SHARED, xp)
         X2 = X2.reshape(1, *X2.shape)
         slope = (X2[..., INNER][..., -1] - X2[..., INNER][..., 0]) / (NODES[INNER][-1] - NODES[INNER][0])
         v = self.reading_variance + (self.trial_scatter * X2[..., MIDDLE]) ** 2 + scatter[..., 0] ** 2
@@ -519,6 +513,5 @@ def _log_probability(lower: Any, upper: Any, special: ModuleType, xp: ModuleType
     """Logarithm of the standard normal probability between ``lower`` and ``upper``, which differ by 1 or more."""
     right = lower > 0.0
     near, far = xp.where(right, lower, -upper), xp.where(right, upper, -lower)
-    found = 0.5 * (special.erfc(near / np.sqrt(2.0)) - special.erfc(far / np.sqrt(2.0)))
-    tail = -0.5 * (near**2 + LOG_2PI) - xp.log(xp.maximum(near, 1.0))
-    return xp.where(found > LEAST, xp.log(xp.maximum(found, LEAST)), tail)
+    first = special.log_ndtr(-near)
+    return first + xp.log1p(-xp.exp(special.log_ndtr(-far) - first))

@@ -74,9 +74,7 @@ def session_table(experiments: "Sequence[Progression]", fit: Fitted) -> list[Res
                     "its sd": float(np.std(factors)) if draws else np.nan,
                 }
             )
-    if not rows:
-        return []
-    return [ResultTable("progression.sessions", pd.DataFrame(rows).set_index("parameter").round(4))]
+    return [ResultTable("progression.sessions", pd.DataFrame(rows).set_index("parameter").round(4))] if rows else []
 
 
 # batches: Functions of many draws of the parameters, in compiled batches on all cores.
@@ -151,8 +149,8 @@ FRICTION_FORCES = ("mu", "mu_back", "viscous")
 OF_TRIALS = ("trial_scatter", "trial_sd", "discrepancy")
 #: Step of the derivative with respect to ``session_sd``, relative.
 SESSION_STEP = 0.1
-#: Draws of a band, and the seed of its sessions and trials.
-BAND_DRAWS, BAND_SEED = 200, 0
+#: Draws of a band.
+BAND_DRAWS = 200
 #: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
 DAMPING_RATIO, FRICTION = 0.1, 0.3
 
@@ -192,6 +190,10 @@ class Progression(CapsuleForward):
     checks = (check_discrepancy,)
     tables = (session_table,)
     emulator: RunEmulator | None
+
+    # The other scatters enter with the parameters, because they change the design.
+    scatters = ("trial_sd",)
+    has_joint_scatters = True
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.set_model(table, rig, friction)
@@ -257,15 +259,6 @@ class Progression(CapsuleForward):
         return self.distance
 
     @property
-    def scatters(self) -> tuple[str]:
-        # The other scatters enter with the parameters, because they change the design.
-        return ("trial_sd",)
-
-    @property
-    def has_joint_scatters(self) -> bool:
-        return True
-
-    @property
     def scaled_by(self) -> dict[str, tuple[str, ...]]:
         return {"session_sd": tuple(f"{symbol}[{self.label}]" for symbol in self.sessions.symbols)}
 
@@ -311,12 +304,6 @@ class Progression(CapsuleForward):
         # Numbers that are no arrays would be constants of the program: each new point would compile it anew.
         return _displacements(self, {name: jnp.asarray(x) for name, x in theta.items()}, s, settings)
 
-    def displacements_of_draws(
-        self, draws: Sequence[ValuesBySymbol], s: np.ndarray, settings: np.ndarray
-    ) -> np.ndarray:
-        """(draws, rows) X2, m, at each draw with friction multiplied by exp(s), s (draws, rows)."""
-        return batched(eqx.Partial(Progression.displacements, self, settings=settings), draws, s)
-
     def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
         """The numbers of every draw for which the likelihood runs the capsule; not finite where a run fails."""
         return batched(eqx.Partial(Progression.runs, self), draws, np.zeros((len(draws), 0)))
@@ -360,6 +347,7 @@ class Progression(CapsuleForward):
     # -- starting points and the report -------------------------------------------------------------------------------
 
     def starts(self) -> dict[str, Start]:
+        """Starts of parameters of the motion and the trials, sampled or not."""
         m1, m2 = self.rig.mass("m1"), self.rig.mass("m2")
         k1 = m1 * (2.0 * np.pi / float(np.median(self.settings[:, 0]))) ** 2
         largest = float(np.max(np.abs(self.distance)))
@@ -371,7 +359,7 @@ class Progression(CapsuleForward):
             "mu_back": Start(FRICTION, 0.5),
             "v_s": Start(0.3, 1.0),
             "ratio": Start(0.7, 0.3),
-            "lag": Start(0.05 * float(np.median(self.settings[:, 0])), 1.0),
+            **({"lag": Start(0.05 * float(np.median(self.settings[:, 0])), 1.0)} if self.lag is None else {}),
             "session_sd": Start(0.05, 0.3),
             **{f"{symbol}[{self.label}]": Start(0.0, 1.0) for symbol in self.sessions.symbols},
             "trial_scatter": Start(0.05, 0.3),
@@ -382,8 +370,7 @@ class Progression(CapsuleForward):
             prior = priors[name]
             friction = FRICTION * (m1 + m2) * self.rig.g.value
             starts[name] = Start(prior.location if abs(prior.location) > prior.spread else friction, 0.5 * prior.spread)
-        known = {row.name for row in self.parameters}
-        return {name: start for name, start in starts.items() if name in known}
+        return starts
 
     def excess_noise(self, theta: ValuesBySymbol) -> float:
         """Total error of a trial relative to its scatter, at the median setting."""
@@ -400,10 +387,12 @@ class Progression(CapsuleForward):
 
     def setting_names(self) -> list[str]:
         """A short name for every setting: period, duty and amplitude where they may differ, number of periods."""
-        duty = ", duty {2:g} %" if self.drive == "pulses" else ""
-        amplitude = {"column": ", {3:g} N", "current": ", {3:g} A"}.get(self.amplitude_from, "")
-        name, scale = "{0:g} ms" + duty + amplitude + ", {1:g} periods", np.array([1e3, 1.0, 100.0, 1.0])
-        return [name.format(*(scale * row)) for row in self.settings]
+        return [f"{1e3 * row[0]:g} ms{self._duty_and_amplitude(row)}, {row[1]:g} periods" for row in self.settings]
+
+    def _duty_and_amplitude(self, row: np.ndarray) -> str:
+        """Duty and amplitude of a row of settings, where they may differ."""
+        duty = f", duty {100.0 * row[2]:g} %" if self.drive == "pulses" else ""
+        return duty + {"column": f", {row[3]:g} N", "current": f", {row[3]:g} A"}.get(self.amplitude_from, "")
 
     def new_trials(self, draws: Sequence[ValuesBySymbol], settings: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(draws, rows) displacement, m, of a new trial in a new session at each row of ``settings`` (rows, 4).
@@ -413,7 +402,7 @@ class Progression(CapsuleForward):
         time = settings[:, 0] * settings[:, 1]
         z = rng.standard_normal((3, len(draws), len(settings)))
         own = {name: np.array([draw[name] for draw in draws])[:, None] for name in ("session_sd", *OF_TRIALS)}
-        X2 = self.displacements_of_draws(draws, own["session_sd"] * z[0], settings)
+        X2 = batched(eqx.Partial(Progression.displacements, self, settings=settings), draws, own["session_sd"] * z[0])
         variance = self.reading_variance + own["trial_sd"] ** 2 + (own["trial_scatter"] * X2) ** 2
         if self.heavy:
             variance = np.where(rng.uniform(size=variance.shape) < OUTLIER_SHARE, TIMES**2, 1.0) * variance
@@ -443,13 +432,11 @@ class Progression(CapsuleForward):
             lower, upper = (None if limit is None else limit[own] for limit in limits)
             rows = np.flatnonzero(self.setting[:, np.all(self.settings[:, 2:] == group, axis=1)].any(axis=1))
             trials = Points(self.label, period[rows], (self.distance * (self.setting @ speed))[rows])
-            amplitude = {"column": f", {group[1]:g} N", "current": f", {group[1]:g} A"}.get(self.amplitude_from, "")
-            duty = f", duty {100.0 * group[0]:g} %" if self.drive == "pulses" else ""
             panels.append(
                 Comparison(
                     "progression",
                     self.label,
-                    f"{self.label}{duty}{amplitude}: mean velocity",
+                    f"{self.label}{self._duty_and_amplitude(settings[own[0]])}: mean velocity",
                     "period [ms]",
                     "mean velocity [mm/s]",
                     (trials,) if len(rows) else (),
@@ -490,7 +477,7 @@ class Progression(CapsuleForward):
         speed = 1e3 / self.time
         centre = np.asarray(self.displacements(theta, np.zeros(len(settings)), settings)) * speed
         chosen = draws[:: max(1, len(draws) // BAND_DRAWS)]
-        trials = self.new_trials(chosen, settings, np.random.default_rng(BAND_SEED)) if chosen else np.empty((0, 0))
+        trials = self.new_trials(chosen, settings, np.random.default_rng(0)) if chosen else np.empty((0, 0))
         limits = band(trials * speed if chosen else trials)
         residuals = np.asarray(self.residuals(theta, np))[: self.n]
         return self.speed_panels(settings, centre, limits, "this fit, 95 % band of a new trial", residuals)

@@ -51,7 +51,7 @@ def test_a_start_that_wavers_is_said_and_the_fit_is_that_of_its_target(monkeypat
 
     def other_kind(target: LogPosterior, *_: object) -> tuple[list[Experiment], dict[str, float]]:
         (own,) = cast(list[ForcedRun], target.experiments)
-        return [own.restarted(0.0 if own.moves else 1e-2)], {}
+        return [own.remade(own.table, capsule_rate=0.0 if own.moves else 1e-2)], {}
 
     monkeypatch.setattr(point_stage, "joint_fit", joint_fit)
     monkeypatch.setattr(point_stage, "correct_starts", other_kind)
