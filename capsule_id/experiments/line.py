@@ -182,7 +182,6 @@ def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
 
 def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
     """Report lines whose scatter the readings do not show: two rows, or readings closer to the line than their step."""
-    del fit
     findings = []
     for e in lines:
         column = e.table.columns[e.reading]
@@ -272,7 +271,6 @@ class Line(PointTest):
 
     def slope_of(self, table: Table) -> Parameter:
         """Row of the slope."""
-        del table
         return parameter(self.symbol)
 
     def own_parameters(self, table: Table) -> tuple[Parameter, ...]:

@@ -300,14 +300,12 @@ def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding
 
 def lint_rows(table: Table[Any], rig: Rig, fewest: int) -> Iterable[Finding]:
     """Warn where a table has fewer than ``fewest`` rows: three for one unknown, five for two."""
-    del rig
     if len(table.rows) < fewest:
         yield Finding("readings.few", "warn", {"rows": len(table.rows), "wanted": fewest}, table.label)
 
 
 def lint_reading_errors(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where columns have no reading error."""
-    del rig
     unstated = [name for name, column in table.columns.items() if column.reading_sd == 0.0]
     if unstated:
         facts = {"names": " and ".join(unstated), "first": unstated[0]}
