@@ -127,7 +127,6 @@ class Experiment(eqx.Module):
         ``friction``, a ``FrictionModel``, is the law that the experiments of a fit share; a kind without a sliding capsule
         ignores it.
         """
-        del friction
         return (cls(table, rig),)  # type: ignore[call-arg, arg-type]  # pyright: ignore
 
     @property
@@ -168,7 +167,6 @@ class Experiment(eqx.Module):
 
     def alternatives(self, theta: ValuesBySymbol) -> dict[str, np.ndarray]:
         """Effect (n,) on the readings, SI, of what a setting that varies can show beside the law, by name of the setting."""
-        del theta
         return {}
 
     def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -275,12 +273,10 @@ class Experiment(eqx.Module):
 
         ``readings`` are the findings on the readings.
         """
-        del readings
         return list(records), []
 
     def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[Experiment, ...], list[Finding]]":
         """Divide the experiment where one initial state cannot predict all of it at ``theta``; also return findings."""
-        del theta
         return (self,), []
 
     @property
@@ -290,14 +286,12 @@ class Experiment(eqx.Module):
 
     def with_coloured_noise(self, theta: ValuesBySymbol) -> tuple[Self, dict[str, float]] | None:
         """Replace white noise that is not stated by coloured noise; also return its starts, SI, by name. None: it stays."""
-        del theta
 
     def corrected_start(self, theta: ValuesBySymbol) -> tuple[Self, dict[str, float]] | None:
         """Replace the kind of initial state where the readings contradict that of ``theta``.
 
         Return the new experiment and the values, SI, by name, from which a fit continues. None: no contradiction.
         """
-        del theta
 
     def profile(self, theta: ValuesBySymbol) -> Callable[[ValuesBySymbol], float]:
         """The log-likelihood as a function of its scatters by symbol, all other values held at ``theta``."""
@@ -305,12 +299,10 @@ class Experiment(eqx.Module):
 
     def excess_noise(self, theta: ValuesBySymbol) -> float:
         """Largest ratio of a noise level of ``theta`` to its estimate from the record alone; 0 without an estimate."""
-        del theta
         return 0.0
 
     def with_smoothing(self, widths: Smoothing | None) -> Self:
         """Return the same readings with the smoothed capsule model of ``widths``; unchanged without a capsule model."""
-        del widths
         return self
 
     def noise_facts(self) -> Facts:
@@ -319,7 +311,6 @@ class Experiment(eqx.Module):
 
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
         """Record for comparison with the figures of the paper; None where there is none."""
-        del theta
 
 
 def no_design(n: int, xp: ModuleType = jnp) -> Any:

@@ -43,7 +43,6 @@ STANDARD_ERRORS, SPEED_RATIO, FEWEST_PUSHES = 3.0, 1.5, 3
 
 def lint_pushes(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Report distances that do not grow with the speed as those of a sliding body do."""
-    del rig
     speed, distance = np.log(table["speed"]), np.log(table["distance"])
     if len(speed) < FEWEST_PUSHES or np.ptp(speed) < np.log(SPEED_RATIO):
         return
@@ -109,7 +108,6 @@ def pushes(
 
 
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
-    del seed
     errors = (
         f'speed_sd = {{ value = {1e3 * SPEED_SD:g}, unit = "mm/s" }}',
         f'distance_sd = {{ value = {1e3 * DISTANCE_SD:g}, unit = "mm" }}',

@@ -244,7 +244,6 @@ def check_variants(experiments: Sequence[FrictionExperiment], fit: Fitted) -> li
     The law in use fails where another one has a marginal likelihood ``FACTOR`` times larger, or where its residuals are
     ordered by speed.
     """
-    del fit
     experiments = [e for e in experiments if e.speeds_known]
     if not experiments:
         return []

@@ -3,10 +3,10 @@
 import os
 import site
 import sysconfig
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache
 from importlib import import_module
 from importlib.metadata import distributions
 from itertools import chain
@@ -154,13 +154,15 @@ BUILT_IN = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Registry(Mapping[str, Kind]):
+class Registry(dict[str, Kind]):
     """Kinds of experiments by name, in a fixed order.
 
     Attributes
     ----------
     packages : version of each installed package that adds a kind, by name of its distribution
+    parameters : every parameter by symbol: the package's table, then the rows of the kinds
+    captions : captions of all panels, by ``Comparison.kind``
+    messages : texts of the checks and tables of all kinds, by code
 
     Raises
     ------
@@ -171,48 +173,20 @@ class Registry(Mapping[str, Kind]):
         If the type of a setting has no rule.
     """
 
-    kinds: tuple[Kind, ...]
-    packages: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if len(self.by_name) < len(self.kinds):
-            names = [kind.name for kind in self.kinds]
+    def __init__(self, kinds: tuple[Kind, ...], packages: Mapping[str, str] | None = None) -> None:
+        super().__init__({kind.name: kind for kind in kinds})
+        self.kinds, self.packages = kinds, packages or {}
+        if len(self) < len(kinds):
+            names = [kind.name for kind in kinds]
             raise ValueError(f"kind {next(n for n in names if names.count(n) > 1)} is declared twice")
-        for kind in self.kinds:
+        for kind in kinds:
             _ = kind.setting_rules
             for row in kind.parameters:
                 if "[" in row.symbol:
                     raise ValueError(f"symbol of parameter {row.symbol} of kind {kind.name} must have no bracket")
-        _ = self.parameters, self.captions, self.messages
-
-    @cached_property
-    def by_name(self) -> dict[str, Kind]:
-        """The kinds by name."""
-        return {kind.name: kind for kind in self.kinds}
-
-    @cached_property
-    def parameters(self) -> Mapping[str, Parameter]:
-        """Every parameter by symbol: the package's table, then the rows of the kinds."""
-        return parameter_rows(self.by_name)
-
-    @cached_property
-    def captions(self) -> Mapping[str, str]:
-        """Captions of all panels, by ``Comparison.kind``."""
-        return _joined("caption", ((kind.name, kind.captions) for kind in self.kinds))
-
-    @cached_property
-    def messages(self) -> Mapping[str, Message]:
-        """Texts of the checks and tables of all kinds, by code."""
-        return _joined("message", ((kind.name, kind.messages) for kind in self.kinds))
-
-    def __getitem__(self, name: str) -> Kind:
-        return self.by_name[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.by_name)
-
-    def __len__(self) -> int:
-        return len(self.kinds)
+        self.parameters: Mapping[str, Parameter] = parameter_rows(self)
+        self.captions: Mapping[str, str] = _joined("caption", ((kind.name, kind.captions) for kind in kinds))
+        self.messages: Mapping[str, Message] = _joined("message", ((kind.name, kind.messages) for kind in kinds))
 
 
 def _joined(what: str, declared: Iterable[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:

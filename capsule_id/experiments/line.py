@@ -115,7 +115,7 @@ def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
     tests = []
     for e in lines:
         keep = np.setdiff1d(np.arange(e.n), fit.flagged.get(e.label, []))
-        tests += [(e, *found) for found in [lack_of_fit(e.x[keep], e.y[keep])] if found is not None]
+        tests += [(e, *found) for found in [lack_of_fit(e.x[keep], e.observed[keep])] if found is not None]
     findings = [
         Finding("lines.replicates", "fail", {"name": e.slope.name, "x": e.x_name, "deviation": size, "p": p}, e.label)
         for e, size, p in tests
@@ -182,11 +182,10 @@ def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
 
 def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
     """Report lines whose scatter the readings do not show: two rows, or readings closer to the line than their step."""
-    del fit
     findings = []
     for e in lines:
         column = e.table.columns[e.reading]
-        if e.errors_known or (e.n > 2 and e.step == 0.0) or (column.sd is not None and e.n < 3):
+        if e.scale_known or (e.n > 2 and e.step == 0.0) or (column.sd is not None and e.n < 3):
             continue
         code = "lines.two_rows" if e.n < 3 else "lines.step"
         facts = {"y": e.reading, "unit": column.unit, "step": e.step * column.to_display, "name": e.slope.name}
@@ -203,7 +202,7 @@ def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int])
         return 0.0, 1.0
     z = (x - np.mean(x)) / np.ptp(x)
     columns = np.stack([np.ones_like(z), z, z**2], axis=1) / sd[:, None]
-    y = line.y[keep] / sd
+    y = line.observed[keep] / sd
     coefficients, *_ = np.linalg.lstsq(columns, y, rcond=None)
     rest = y - columns @ coefficients
     covariance = np.linalg.inv(columns.T @ columns)
@@ -243,13 +242,13 @@ class Line(PointTest):
     width : sd of the intercept's prior, SI
     sd_ratio : stated ratio of both errors; None: not stated
     step : step of the last digit of y, SI, where it exceeds the scatter about the line and no error of y is stated; else 0
-    errors_known : whether both reading errors are stated
+    scale_known : whether both reading errors are stated
     """
 
     width: float
     sd_ratio: float | None
     step: float
-    errors_known: bool = eqx.field(static=True)
+    scale_known: bool = eqx.field(static=True)  # type: ignore[misc]  # pyright: ignore
 
     #: Column of x, and symbol of the slope.
     x_name: ClassVar[str]
@@ -264,7 +263,7 @@ class Line(PointTest):
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         y = table.columns[self.reading]
         self.width, self.sd_ratio = NUISANCE_WIDTH * float(np.ptp(y.values)), table.settings.sd_ratio
-        self.errors_known = all(table.columns[name].sd is not None for name in (self.x_name, self.reading))
+        self.scale_known = all(table.columns[name].sd is not None for name in (self.x_name, self.reading))
         super().__init__(table, rig, friction)
         step = y.unstated_step
         self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
@@ -272,39 +271,30 @@ class Line(PointTest):
 
     def slope_of(self, table: Table) -> Parameter:
         """Row of the slope."""
-        del table
         return parameter(self.symbol)
 
     def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
         slope, factor = self.slope_of(table), SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW
-        prior = Prior("lognormal", SCATTER_MEDIAN * float(np.ptp(self.y)), factor)
+        prior = Prior("lognormal", SCATTER_MEDIAN * float(np.ptp(self.observed)), factor)
         scatter = replace(parameter("scatter", table.label, prior), unit=self.unit_of_y)
-        return (slope,) if self.errors_known else (slope, scatter)
+        return (slope,) if self.scale_known else (slope, scatter)
 
     @property
     def x(self) -> np.ndarray:
         return self.readings[self.x_name]
 
     @property
-    def y(self) -> np.ndarray:
-        return self.observed
-
-    @property
     def slope(self) -> Parameter:
         return self.parameters[0]
 
     @property
-    def scale_known(self) -> bool:
-        return self.errors_known
-
-    @property
     def scatters(self) -> tuple[str | None, ...]:
-        return (None,) if self.errors_known else ("scatter",)
+        return (None,) if self.scale_known else ("scatter",)
 
     @property
     def errors(self) -> str:
         """Error model in words, for the report."""
-        if self.errors_known:
+        if self.scale_known:
             return "errors in both columns, as stated"
         if self.sd_ratio is not None:
             return "errors in both columns, their ratio as stated, their size estimated"
@@ -321,7 +311,7 @@ class Line(PointTest):
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
         (plain,) = super().misfits(theta, xp)
-        if self.errors_known:
+        if self.scale_known:
             return (replace(plain, scale=0.0, ordinate=(self.sds[self.reading] ** 2, 0.0)),)
         if self.sd_ratio is None:
             return (plain,)
@@ -332,17 +322,17 @@ class Line(PointTest):
 
     def ordinary_line(self) -> tuple[float, float, float]:
         """Slope, intercept and residual sd of ordinary least squares, the paper's fit; slope 0 at one level of x."""
-        x, y = self.x - np.mean(self.x), self.y - np.mean(self.y)
+        x, y = self.x - np.mean(self.x), self.observed - np.mean(self.observed)
         slope = x @ y / (x @ x) if x @ x > 0.0 else 0.0
-        intercept = np.mean(self.y) - slope * np.mean(self.x)
+        intercept = np.mean(self.observed) - slope * np.mean(self.x)
         rest = y - slope * x
         return float(slope), float(intercept), float(np.sqrt(rest @ rest / max(self.n - 2, 1)))
 
     def starts(self) -> dict[str, Start]:
         slope, _, sd = self.ordinary_line()
         starts = {self.slope.name: Start(abs(slope), 0.4)}
-        if not self.errors_known:
-            starts[f"scatter[{self.label}]"] = Start(max(sd, 1e-6 * float(np.ptp(self.y))), 0.3)
+        if not self.scale_known:
+            starts[f"scatter[{self.label}]"] = Start(max(sd, 1e-6 * float(np.ptp(self.observed))), 0.3)
         return starts
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:

@@ -300,14 +300,12 @@ def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding
 
 def lint_rows(table: Table[Any], rig: Rig, fewest: int) -> Iterable[Finding]:
     """Warn where a table has fewer than ``fewest`` rows: three for one unknown, five for two."""
-    del rig
     if len(table.rows) < fewest:
         yield Finding("readings.few", "warn", {"rows": len(table.rows), "wanted": fewest}, table.label)
 
 
 def lint_reading_errors(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where columns have no reading error."""
-    del rig
     unstated = [name for name, column in table.columns.items() if column.reading_sd == 0.0]
     if unstated:
         facts = {"names": " and ".join(unstated), "first": unstated[0]}
@@ -416,8 +414,13 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
         return
     burst = noisy_stretch(values, period / step, jump.row)
     if burst is not None:
-        rows = slice(used.start + burst.start, used.start + burst.stop)
-        yield _burst(table, name, rows, used, burst.start < KEPT_PERIODS * period / step)
+        first, last = used.start + burst.start, used.start + burst.stop
+        begin, end = float(table["time"][first]), float(table["time"][min(last, used.stop - 1)])
+        # An early burst is left out with what is before it.
+        key, cut = ("start", end) if burst.start < KEPT_PERIODS * period / step else ("stop", begin)
+        place = {"column": name, "begin": begin, "end": end, "key": key, "value": _rounded(table, used, cut)}
+        facts = {**place, "cut": _cut(table, used, key, cut)}
+        yield _fault(table, "readings.burst", np.array([first, last - 1]), "fail", **facts)
         return
     if jump.noisy:
         return
@@ -441,21 +444,3 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
         "rule": f'{{ rule = "hampel", window = "{1e3 * float(f"{WINDOW * step:.6g}"):g} ms", n_sd = {n_sd:g} }}',
     }
     yield _fault(table, "readings.spike" if len(spikes) else "readings.jump", used.start + rows, "fail", **facts)
-
-
-def _burst(table: Table[Any], name: str, burst: slice, used: slice, early: bool) -> Finding:
-    """A stretch of noise, and the line of ``rig.toml`` that leaves it out: an ``early`` one with what is before it."""
-    time = table["time"]
-    begin, end = float(time[burst.start]), float(time[min(burst.stop, used.stop - 1)])
-    facts = {
-        "file": table.file,
-        "line": int(table.rows[burst.start]),
-        "column": name,
-        "begin": begin,
-        "end": end,
-        "key": "start" if early else "stop",
-        "value": _rounded(table, used, end if early else begin),
-        "cut": _cut(table, used, "start" if early else "stop", end if early else begin),
-        "rows": [burst.start, burst.stop - 1],
-    }
-    return Finding("readings.burst", "fail", facts, table.label)

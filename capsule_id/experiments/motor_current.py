@@ -37,7 +37,6 @@ def calibration(
 
 
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
-    del seed
     errors = (
         f'force_sd = {{ value = {FORCE_SD:g}, unit = "N" }}',
         f'current_sd = {{ value = {CURRENT_SD:g}, unit = "A" }}',

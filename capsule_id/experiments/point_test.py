@@ -77,7 +77,6 @@ class PointTest(GroundExperiment):
 
     def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
         """The rows that ``reads`` names, and the scatter."""
-        del table
         rows: list[Parameter] = []
         for one in self.reads:
             rows += self.friction.parameters if one == FRICTION else [parameter(one) if isinstance(one, str) else one]

@@ -107,7 +107,6 @@ def tilts(
 
 
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
-    del seed
     return Twin((TwinTable("static_friction.csv", tilts(rng, values["mu"])),))
 
 

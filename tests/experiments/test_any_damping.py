@@ -187,12 +187,12 @@ def test_a_richer_model_is_never_worse_than_one_that_it_contains() -> None:
     screenings = [Screening(record(0.0, {"F_dry": 0.02 * SPRING_FORCE}))]
     forces, _ = open_models(record(0.0))
     ranked = rank(screenings, forces)
-    pairs = [(one, other) for one in ranked for other in ranked if one.model.nested_in(other.model)]
+    pairs = [(one, other) for one in ranked for other in ranked if one.model.terms < other.model.terms]
     assert len(pairs) == 19
     for one, other in pairs:
         assert other.fits[0][0].noise <= one.fits[0][0].noise * (1.0 + 1e-9)
     # Every fit keeps the values of the fits that it contains, from which the quoted fit starts too.
-    assert [len(one.fits[0][0].nested) for one in sorted(ranked, key=lambda one: one.model.size)] == [
+    assert [len(one.fits[0][0].nested) for one in sorted(ranked, key=lambda one: len(one.model.terms))] == [
         0,
         1,
         1,

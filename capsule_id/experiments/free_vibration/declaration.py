@@ -44,7 +44,6 @@ DECAY_NOISE = 0.01
 
 def measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     """Simulate one record per release amplitude."""
-    del seed
     decays = [decay(rng, values["k1"], values["c"], values["m1"], release, DECAY_NOISE) for release in RELEASES]
     return Twin(tuple(TwinTable(f"free_vibration_{n}.csv", columns) for n, columns in enumerate(decays, start=1)))
 

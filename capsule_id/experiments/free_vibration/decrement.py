@@ -61,23 +61,16 @@ SINGULAR = 1e-13
 def viscous_basis(time: Any, k1: Any, c: Any, m1: Any, xp: ModuleType) -> Any:
     """(n, 2) motions of unit size at any damping: released at rest, and struck at the rest position at rate omega_0."""
     gamma, square = c / (2.0 * m1), k1 / m1
-    even, odd = _even_and_odd(time, gamma, square, xp)
-    return xp.stack([even + gamma * odd, xp.sqrt(square) * odd], axis=-1)
-
-
-def _even_and_odd(time: Any, gamma: Any, square: Any, xp: ModuleType) -> tuple[Any, Any]:
-    """exp(-gamma t) times cos(omega t) and sin(omega t)/omega, (n,) each: both are smooth at critical damping.
-
-    Beyond it omega = i root, and the two exponentials decay with gamma - root = omega_0^2/(gamma + root) and gamma + root.
-    """
+    # even and odd are exp(-gamma t) times cos(omega t) and sin(omega t)/omega: both are smooth at critical damping. Beyond
+    # it omega = i root; two exponentials decay with gamma - root = omega_0^2/(gamma + root) and gamma + root.
     margin = square - gamma**2
     root = xp.sqrt(xp.maximum(xp.abs(margin), CRITICAL * square))
     fast = xp.where(margin > 0.0, 0.0, gamma + root)  # not used there, and must stay finite
     slow = xp.exp(-xp.where(margin > 0.0, 0.0, square / (gamma + root)) * time)
     envelope, angle = xp.exp(-gamma * time), root * time
     even = xp.where(margin > 0.0, envelope * xp.cos(angle), 0.5 * (slow + xp.exp(-fast * time)))
-    odd = xp.where(margin > 0.0, envelope * xp.sin(angle), -0.5 * slow * xp.expm1(-2.0 * angle))
-    return even, odd / root
+    odd = xp.where(margin > 0.0, envelope * xp.sin(angle), -0.5 * slow * xp.expm1(-2.0 * angle)) / root
+    return xp.stack([even + gamma * odd, xp.sqrt(square) * odd], axis=-1)
 
 
 def viscous_state(

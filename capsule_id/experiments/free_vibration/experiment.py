@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import Start, ValuesBySymbol
+from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks import LEVEL, refit
 from capsule_id.experiments.context import Check, Fitted
 from capsule_id.experiments.free_vibration.decrement import equilibrium
@@ -102,7 +102,10 @@ def check_free_decay(records: Sequence[DecayRecord], fit: Fitted) -> list[Findin
     for e in records:
         needed = {"m2", *(row.symbol for row in e.friction.parameters_at_rest)}
         if e.table.settings.capsule == "free" and needed <= set(theta):
-            force = e.largest_force(theta)
+            force = theta["k1"] * e.largest_deflection
+            if e.order == 0:  # f = k1 x_rel + c d(x_rel)/dt
+                x = e.smoothed() - equilibrium(e.values)
+                force = float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, e.condensed[0]))))
             threshold = float(e.friction.force(theta).forward(0.0))
             if force > threshold:
                 findings.append(Finding("decays.slip", "fail", {"force": force, "F_b": threshold}, e.label))
@@ -283,7 +286,7 @@ def _halves(e: DecayRecord) -> list[DecayRecord]:
     settings = e.table.settings
     spans = (replace(settings, start=begin, stop=middle), replace(settings, start=middle, stop=end))
     tables = [replace(e.table, settings=span) for span in spans]
-    return [type(e)(table, e.rig, e.friction, e.model) for table in tables]
+    return [e.with_model(e.model, table=table) for table in tables]
 
 
 def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
@@ -357,17 +360,8 @@ class FreeVibration(DecayRecord):
     )
     tables = (decay_table, damping_table)
 
-    @classmethod
-    def second_models(
-        cls, records: "Sequence[Any]", readings: Sequence[Finding] = ()
-    ) -> tuple[list[Any], list[Finding]]:
-        return second_models(records, readings)
-
-    def starts(self) -> dict[str, Start]:
-        return decay_starts(self)
-
-    def nested_starts(self) -> Sequence[Mapping[str, float]]:
-        return nested_starts(self)
+    second_models = staticmethod(second_models)
+    starts, nested_starts = decay_starts, nested_starts
 
     def noise_facts(self) -> Facts:
         facts = {"present": self.model.additions, "second": self.replaced, "lines": self.lines}

@@ -33,12 +33,17 @@ RESPONSE_POINTS, FEWEST_POINTS = 60, 200
 COMBINATION = 1e-8
 
 
-def sensitivities(e: Decay, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Residuals (n,), design of the linear nuisances (n, p), and derivatives of the residuals by symbol, (n,) each."""
+def sensitivities(
+    e: Decay, theta: Mapping[str, float], names: Sequence[str] = ()
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Residuals (n,), design of the linear nuisances (n, p), and derivatives of the residuals by symbol, (n,) each.
+
+    ``names`` of the parameters that are moved; default: those of the motion.
+    """
     raw, design = e.unwhitened(theta, np)
     nuisances = np.linalg.lstsq(e.whitened(theta, design), e.whitened(theta, raw), rcond=None)[0]
     left, units, moved = raw - design @ nuisances, _units(e, theta), {}
-    for name in ("k1", "c", *e.model.symbols, *e.own_symbols):
+    for name in names or ("k1", "c", *e.model.symbols, *e.own_symbols):
         other, basis = e.unwhitened({**theta, name: theta[name] + SENSITIVITY_STEP * units[name]}, np)
         moved[name] = (other - basis @ nuisances - left) / (SENSITIVITY_STEP * units[name])
     return left, design, moved
@@ -49,14 +54,7 @@ def further_sensitivities(e: Decay, theta: Mapping[str, float]) -> dict[str, np.
     if isinstance(e, DecayRecord) and e.closed:
         return {name: -response for name, response in force_responses(e, theta).items()}
     full = e.with_model(replace(e.model, damping=tuple(DAMPING), cubic=True))
-    names = e.model.absent
-    known = {**theta, **dict.fromkeys(names, 0.0)}
-    raw, units = full.unwhitened(known, np)[0], _units(e, theta)
-    return {
-        name: (full.unwhitened({**known, name: SENSITIVITY_STEP * units[name]}, np)[0] - raw)
-        / (SENSITIVITY_STEP * units[name])
-        for name in names
-    }
+    return sensitivities(full, {**theta, **dict.fromkeys(e.model.absent, 0.0)}, e.model.absent)[2]
 
 
 def force_responses(e: DecayRecord, theta: Mapping[str, float]) -> dict[str, np.ndarray]:
@@ -151,7 +149,7 @@ def zero_jumps(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | N
     settings = replace(e.table.settings, start=begin, stop=begin + float(min(end, time[-1])))
     thin = block_size(time[time <= end], values[time <= end], 2.0 * MOST_READINGS)
     model = replace(e.model, thin=thin, noise="white", drift="none")
-    part = type(e)(replace(e.table, settings=settings), e.rig, e.friction, model)
+    part = e.with_model(model, table=replace(e.table, settings=settings))
     left, design, moved = sensitivities(part, theta)
     curve = part.values - left
     rate = np.gradient(curve, part.time)

@@ -345,19 +345,9 @@ class DecayModel:
         return tuple(symbol for symbol in FURTHER if symbol not in self.symbols)
 
     @property
-    def _terms(self) -> set[str]:
-        """Everything that the model adds to the simplest one."""
-        noise = {"white": (), "ar1": ("ar1",), "arma": ("ar1", "white")}[self.noise]
-        return {*self.symbols, *noise, *(() if self.drift == "none" else (self.drift,))}
-
-    @property
-    def size(self) -> int:
-        """Number of terms that it adds to the simplest model; a model contains only smaller ones."""
-        return len(self._terms)
-
-    def nested_in(self, other: "DecayModel") -> bool:
-        """Whether ``other`` contains this model."""
-        return self._terms < other._terms
+    def terms(self) -> set[str]:
+        """Everything that the model adds to the simplest one; a model contains those whose terms are a part of its own."""
+        return {*self.symbols, *self.shapes, *({self.drift} & {"linear"})}
 
     @property
     def slow(self) -> bool:

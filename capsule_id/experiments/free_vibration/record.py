@@ -112,21 +112,6 @@ class ReadingTimes(eqx.Module):
         return cls(blocks.time, blocks.first, blocks.last, count, step, int(np.max(count)))
 
 
-def noise_parameters(model: DecayModel, time: np.ndarray, period: float, of: str) -> list[Parameter]:
-    """Return the shape parameters of noise and drift of the record ``of``, sampled at ``time`` (n,), s.
-
-    The noise's correlation time lies between the sampling step and the record's length, the drift's between the period
-    (s) of the decay and the square of the record's length over it.
-    """
-    length = float(np.ptp(time))
-    priors = {
-        "noise_time": Prior("lognormal", float(length / np.sqrt(len(time))), float(np.sqrt(len(time)))),
-        "drift_time": Prior("lognormal", 0.3 * length, max(3.0, 0.3 * length / period)),
-    }
-    rows = {row.symbol: row for row in (NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME)}
-    return [rows[symbol].named(of, priors.get(symbol)) for symbol in model.shapes]
-
-
 def whiten(times: ReadingTimes, columns: Any, model: DecayModel, theta: ValuesBySymbol) -> Any:
     """Map columns (n, q) to the coordinates where noise and drift are white with the noise's innovation sd; (n, q).
 
@@ -227,7 +212,7 @@ class DecayAbout(About):
     """
 
     screened: Screened | None = field(default=None, compare=False)
-    rough: Decrement | None = field(default=None, compare=False)
+    rough: Any = field(default=None, compare=False)
 
 
 class Decay(SurfaceExperiment):
@@ -255,9 +240,9 @@ class Decay(SurfaceExperiment):
     def whitened(self, theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
         """Columns (m,) or (m, q) in the coordinates where the noise, and a drift, are white."""
 
-    def with_model(self, model: DecayModel, screened: Screened | None = None) -> Self:
-        """Return the same readings with another model; its fit ``screened`` gives the starting point."""
-        return type(self)(self.table, self.rig, self.friction, model, screened)  # type: ignore[call-arg]  # pyright: ignore
+    def with_model(self, model: DecayModel, screened: Screened | None = None, table: Table | None = None) -> Self:
+        """Return the same readings, or other ones, with a model; its fit ``screened`` gives the starting point."""
+        return type(self)(table or self.table, self.rig, self.friction, model, screened)  # type: ignore[call-arg]  # pyright: ignore
 
     @property
     @abstractmethod
@@ -267,7 +252,6 @@ class Decay(SurfaceExperiment):
     @property
     def rough(self) -> Decrement:
         """The paper's estimate, or that of a least-squares fit where there are too few peaks."""
-        assert self.about.rough is not None, "the constructor sets it"
         return self.about.rough
 
     @property
@@ -389,21 +373,26 @@ class DecayRecord(Decay):
         self.about = replace(self.about, parameters=(*self._rows(), *clock_parameters(table, rig)))
 
     def _rows(self) -> list[Parameter]:
-        """Its parameters, without the drift of its clock."""
-        label = self.table.label
+        """Its parameters, without the drift of its clock.
+
+        The noise's correlation time lies between the sampling step and the record's length, the drift's between the
+        period of the decay and the square of the record's length over it.
+        """
+        label, length, root = self.table.label, float(np.ptp(self.time)), float(np.sqrt(len(self.time)))
         rows = [parameter("k1"), parameter("c"), self.channel.noise.named(label, self.noise_prior())]
-        if self.model.whitened:
-            rows += noise_parameters(self.model, self.time, 2.0 * np.pi / self.rough.Omega_o, label)
+        shapes = {
+            "noise_time": NOISE_TIME.named(label, Prior("lognormal", length / root, root)),
+            "white_ratio": WHITE_RATIO.named(label),
+            "drift_ratio": DRIFT_RATIO.named(label),
+            "drift_time": DRIFT_TIME.named(label, Prior("lognormal", 0.3 * length, max(3.0, 0.3 * self.cycles[-1]))),
+        }
+        rows += [shapes[symbol] for symbol in self.model.shapes]
         if not self.closed:
             rows += further_parameters(self.model.symbols, self.rough.k1, self.mass, self.largest_deflection)
             size = self.deflection * float(np.ptp(self.values))
             rows.append(AMPLITUDE.named(label, Prior("lognormal", size, NUISANCE_WIDTH)))
             rows.append(TURNING_TIME.named(label, Prior("normal", 0.0, float(self.time[-1]))))
         return rows
-
-    def with_table(self, table: Table) -> Self:
-        """Return the record of another part of its table, with the same model."""
-        return self if table is self.table else type(self)(table, self.rig, self.friction, self.model)
 
     @property
     def explains_trend(self) -> bool:
@@ -498,15 +487,10 @@ class DecayRecord(Decay):
         time, values = shortened(*decay_window(self.table))
         return time - time[0], values
 
-    @property
-    def even(self) -> bool:
-        """Whether the record is evenly sampled, as the paper's filter requires."""
-        return is_even(self.condensed[0])
-
     def smoothed(self) -> np.ndarray:
         """The condensed record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
         time, values = self.condensed
-        if not self.even:
+        if not is_even(time):
             return values
         window = self.table.settings.smoothing_window or choose_window(time, values, SMOOTHING_ORDER)
         return savitzky_golay(time, values, window, SMOOTHING_ORDER)
@@ -518,7 +502,7 @@ class DecayRecord(Decay):
 
     def paper_decrement(self, smooth: bool = True) -> Decrement | None:
         """Estimate k1 and c of this record as in the paper; None also for a record sampled unevenly."""
-        return self.decrement(smooth) if self.even else None
+        return self.decrement(smooth) if is_even(self.condensed[0]) else None
 
     def _rough(self) -> Decrement:
         decrement = self.decrement()
@@ -562,10 +546,3 @@ class DecayRecord(Decay):
         decrement = self.decrement()
         facts = {} if decrement is None else trend(decrement, noise_level(self.values))
         return facts and {**facts, "amplitude": tuple(self.deflection * size for size in facts["amplitude"])}
-
-    def largest_force(self, theta: ValuesBySymbol) -> float:
-        """Largest |f| over the record, N; f = k1 x_rel + c d(x_rel)/dt."""
-        if self.order > 0:
-            return float(theta["k1"]) * self.largest_deflection
-        x = self.smoothed() - equilibrium(self.values)
-        return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.condensed[0]))))

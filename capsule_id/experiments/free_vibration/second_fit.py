@@ -492,7 +492,7 @@ def rank(screenings: Sequence[Screening], models: Iterable[DecayModel], near: Ra
     done: list[Ranking] = []
 
     def fitted(model: DecayModel) -> Ranking:
-        nested = [one for one in done if one.model.nested_in(model)]
+        nested = [one for one in done if one.model.terms < model.terms]
         fits = tuple(
             screening.fit(model, start, [one.fits[i] for one in nested])
             for i, (screening, start) in enumerate(zip(screenings, starts, strict=True))
@@ -504,7 +504,7 @@ def rank(screenings: Sequence[Screening], models: Iterable[DecayModel], near: Ra
         return Ranking(model, np.inf if drowned else sum(screened.bic for screened, _ in fits), fits)
 
     # The first model compiles the programs that all threads then call.
-    for _, same_size in itertools.groupby(sorted(models, key=lambda one: one.size), lambda one: one.size):
+    for _, same_size in itertools.groupby(sorted(models, key=lambda one: len(one.terms)), lambda one: len(one.terms)):
         first, *level = same_size
         done += [*([] if done else [fitted(first)]), *pool().map(fitted, [first, *level] if done else level)]
     return sorted(done, key=lambda one: one.bic)
@@ -654,7 +654,7 @@ def _demanded(records: list[DecayRecord], level: float) -> Demanded:
     contradicting = [e.label for e in records if e.n >= SHORTEST and demands_another(e, level)]
     if not contradicting:
         return (), records, {}
-    own = [e.with_table(first_periods(e.table)) for e in records]
+    own = [e.with_model(e.model, table=first_periods(e.table)) for e in records]
     ranking = demanded_model(own)
     text = _drift_text(own, ranking)
     if ranking.model.slow and any(part.n < whole.n for part, whole in zip(own, records, strict=True)):

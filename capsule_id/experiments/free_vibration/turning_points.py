@@ -354,11 +354,9 @@ class TurningPoints(Decay):
     def second_models(
         cls, records: "Sequence[Any]", readings: Sequence[Finding] = ()
     ) -> tuple[list[Any], list[Finding]]:
-        del readings
         return replaced(records, range(len(records)), demanded, screened)
 
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
-        del xp
         misfit = self.misfit(theta)
         return misfit.raw, misfit.design
 
@@ -388,7 +386,6 @@ class TurningPoints(Decay):
 
     def paper_decrement(self, smooth: bool = True) -> Decrement:
         """Observed frequency and logarithmic decrement of the turning points; ``smooth`` has no effect."""
-        del smooth
         peaks = self.values - (0.5 * (self.values[-1] + self.values[-2]) if self.both_sides else 0.0)
         return Decrement.of(self.index, self.time, peaks, self.mass, smallest=0.05)
 
