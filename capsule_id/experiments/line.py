@@ -198,19 +198,14 @@ def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int])
     misfit = line.misfit(theta)
     keep = np.setdiff1d(np.arange(line.n), left_out)
     x, sd = line.x[keep], misfit.sd[keep]
-    if len(keep) < 4 or len(np.unique(x)) < 3:
+    z = (x - np.mean(x)) / (np.ptp(x) or 1.0)
+    if len(keep) < 4 or len(np.unique(np.round(z, 9))) < 3:
         return 0.0, 1.0
-    z = (x - np.mean(x)) / np.ptp(x)
-    columns = np.stack([np.ones_like(z), z, z**2], axis=1) / sd[:, None]
-    y = line.observed[keep] / sd
-    coefficients, *_ = np.linalg.lstsq(columns, y, rcond=None)
-    rest = y - columns @ coefficients
-    covariance = np.linalg.inv(columns.T @ columns)
-    freedom = len(keep) - 3
-    variance = 1.0 if line.scale_known else float(rest @ rest) / max(freedom, 1)
-    score = abs(coefficients[2]) / np.sqrt(max(variance * covariance[2, 2], 1e-300))
-    p = 2.0 * (stats.norm.sf(score) if line.scale_known else stats.t.sf(score, max(freedom, 1)))
-    return float(coefficients[2] * 0.25 / abs(coefficients[1])), float(p)
+    variances = "unscaled" if line.scale_known else True
+    coefficients, covariance = np.polyfit(z, line.observed[keep], 2, w=1.0 / sd, cov=variances)
+    score = abs(coefficients[0]) / np.sqrt(max(covariance[0, 0], 1e-300))
+    p = 2.0 * (stats.norm.sf(score) if line.scale_known else stats.t.sf(score, len(keep) - 3))
+    return float(coefficients[0] * 0.25 / abs(coefficients[1])), float(p)
 
 
 def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks import LEVEL, refit
 from capsule_id.experiments.context import Check, Fitted
 from capsule_id.experiments.free_vibration.decrement import equilibrium
@@ -360,8 +360,15 @@ class FreeVibration(DecayRecord):
     )
     tables = (decay_table, damping_table)
 
-    second_models = staticmethod(second_models)
-    starts, nested_starts = decay_starts, nested_starts
+    @classmethod
+    def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
+        return second_models(records, readings)
+
+    def starts(self) -> dict[str, Start]:
+        return decay_starts(self)
+
+    def nested_starts(self) -> Sequence[Mapping[str, float]]:
+        return nested_starts(self)
 
     def noise_facts(self) -> Facts:
         facts = {"present": self.model.additions, "second": self.replaced, "lines": self.lines}
