@@ -29,8 +29,8 @@ from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding, Level, ResultTable
 
-#: Joint sds apart from which halves of a record disagree, and from which that fails.
-HALVES_DISAGREE, HALVES_FAIL = 3.0, 4.0
+#: Joint sds apart from which halves of a decay disagree or a force is seen, and from which that fails.
+DISAGREE, FAIL = 3.0, 4.0
 #: Fewest readings and half cycles of a half; fewest half cycles that a later start leaves.
 FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
@@ -130,7 +130,7 @@ def halves(changes: Changes) -> Check:
         name = max(found, key=lambda name: abs(found[name][2]))
         first, second, z, matters = found[name]
         facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
-        level = "ok" if not abs(z) > HALVES_DISAGREE else "fail" if abs(z) > HALVES_FAIL and matters else "warn"
+        level = "ok" if not abs(z) > DISAGREE else "fail" if abs(z) > FAIL and matters else "warn"
         return {**facts, "model": e.model_name, "stated": e.stated_words}, level
 
     return each("decays.halves", judge)
