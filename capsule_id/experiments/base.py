@@ -318,6 +318,11 @@ def no_design(n: int, xp: ModuleType = jnp) -> Any:
     return xp.zeros((n, 0))
 
 
+def scatter_prior(size: float) -> Prior:
+    """Default prior of a standard deviation that only the readings show; ``size`` is their range."""
+    return Prior("lognormal", 0.01 * size, 100.0)
+
+
 def axis_label(column: Column, symbol: str = "") -> str:
     """Return the axis label ``name, unit``."""
     return f"{symbol or column.name} [{column.unit}]"

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol, clock_parameters, stretch
+from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol, clock_parameters, scatter_prior, stretch
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -155,7 +155,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         rows += stated_parameters("G", gap, table.label)
         rows.append(parameter("x_start", table.label, Prior("normal", 0.0, self.width)))
         rows.append(parameter("y_start", table.label, Prior("normal", 0.0, self.width * self.rough.Omega_o)))
-        rows += [NOISE_SD.named(table.label, self.noise_prior()), *ground_parameters(table, rig)]
+        rows += [NOISE_SD.named(table.label, scatter_prior(float(np.ptp(self.values)))), *ground_parameters(table, rig)]
         rows += clock_parameters(table, rig)
         self.about = replace(self.about, parameters=tuple(rows))
 

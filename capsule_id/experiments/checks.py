@@ -137,11 +137,9 @@ def estimate(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[i
     finite = bool(np.isfinite(solution.jac).all())
     covariance = np.linalg.pinv(solution.jac.T @ solution.jac) if finite else np.full((len(at), len(at)), np.inf)
     values = values_of(solution.x)
-    variances = np.diag(covariance)
-    # Rounding may leave a negative variance, where two parameters have the same effect.
-    known = (variances > 0.0) & np.isfinite(variances)
-    errors = np.full(len(at), np.inf)
-    errors[known] = np.abs(at if signed else values)[known] * np.sqrt(variances[known])
+    # Rounding may leave a variance of no positive value, where two parameters have the same effect.
+    variances = np.where(np.diag(covariance) > 0.0, np.diag(covariance), np.inf)
+    errors = np.where(np.isfinite(variances), np.abs(at if signed else values), 1.0) * np.sqrt(variances)
     return Refit(
         {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)},
         1.0 if experiment.scale_known else float(2.0 * solution.cost / freedom),

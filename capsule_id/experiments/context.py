@@ -61,9 +61,11 @@ class Fitted(Protocol):
 
     def tension(self, one: Sequence[Any], other: Sequence[Any]) -> Tension:
         """Likelihood-ratio test that two groups of experiments share their parameters."""
+        ...
 
     def correlation(self, names: Sequence[str]) -> np.ndarray:
         """(n, n) correlations of parameters, of the draws or, without a sample, at the maximum."""
+        ...
 
 
 #: A check maps the experiments that declare it, and the fit, to findings; a table function maps them to tables.

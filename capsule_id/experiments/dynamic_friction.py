@@ -21,7 +21,6 @@ from capsule_id.experiments.friction import (
     unit_law,
     weight_along,
 )
-from capsule_id.experiments.friction_variants import CHECKS
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors
 from capsule_id.parameters import Prior, scatter
@@ -46,12 +45,10 @@ def lint_pushes(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     speed, distance = np.log(table["speed"]), np.log(table["distance"])
     if len(speed) < FEWEST_PUSHES or np.ptp(speed) < np.log(SPEED_RATIO):
         return
-    centred = speed - np.mean(speed)
-    power = float(centred @ distance / (centred @ centred))
-    rest = distance - np.mean(distance) - power * centred
-    error = float(np.sqrt(rest @ rest / (len(speed) - 2) / (centred @ centred)))
+    (power, _), covariance = np.polyfit(speed, distance, 1, cov=True)
+    error = np.sqrt(covariance[0, 0])
     if power + STANDARD_ERRORS * error < SMALLEST_POWER:
-        facts = {"file": table.file, "power": power, "error": error}
+        facts = {"file": table.file, "power": float(power), "error": float(error)}
         yield Finding("pushes.power", "fail", facts, table.label)
 
 
@@ -194,13 +191,6 @@ class Track(NamedTuple):
         return array_module(braking).maximum(braking - self.along / self.normal, LEAST_BRAKING * braking)
 
 
-def track_of(theta: ValuesBySymbol, ground: Mapping[str, Any], backward: bool) -> Track:
-    """The track of a slide; theta has g and, where ``ground`` has N0, m1 and m2."""
-    mass = theta["m1"] + theta["m2"] if "N0" in ground else 1.0
-    normal = normal_force(mass, 0.0, theta["g"], ground.get("slope"), ground.get("N0")) / mass
-    return Track(normal, weight_along(1.0, theta["g"], ground, backward))
-
-
 # experiment: Pushes: an initial speed and the distance slid, rod locked to the capsule (paper, section 2.2).
 
 
@@ -213,7 +203,6 @@ class DynamicFriction(FrictionExperiment):
     """
 
     role, reading, scatter = "dynamic", "distance", PUSH_SCATTER
-    checks = CHECKS
 
     @property
     def masses(self) -> tuple[str, ...]:
@@ -221,7 +210,9 @@ class DynamicFriction(FrictionExperiment):
 
     def track(self, theta: ValuesBySymbol) -> Track:
         """Normal force and weight along the slope at ``theta``."""
-        return track_of(theta, self.ground_at(theta), self.backward)
+        ground, mass = self.ground_at(theta), theta["m1"] + theta["m2"] if "N0" in self.ground else 1.0
+        normal = normal_force(mass, 0.0, theta["g"], **ground) / mass
+        return Track(normal, weight_along(1.0, theta["g"], ground, self.backward))
 
     def coefficient(self, theta: ValuesBySymbol) -> FrictionLaw:
         """The friction coefficient at ``theta``."""

@@ -14,6 +14,7 @@ from capsule_id.experiments.base import Start, ValuesBySymbol, band
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, has_stated_load
+from capsule_id.experiments.friction_variants import check_variants
 from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.experiments.point_test import FRICTION, PointTest
@@ -86,6 +87,12 @@ def check_load(entry: Entry[Any]) -> None:
         raise entry.error("", rule, "none", remedy)
     if table.settings.load_is is not None and not needed:
         raise entry.error("load_is", "load_is needs a slope and a stated normal force", "no such", "remove it", True)
+
+
+def masses_of_pulls(table: Table[Any]) -> tuple[str, ...]:
+    """Symbols of the masses that pulls need: a force that no stated load explains alone overcomes the weight."""
+    weighed = not has_stated_load(table) or table.settings.load_is == "pressed"
+    return ("m1", "m2") if "force" in table.columns and weighed else ()
 
 
 def lint_slides(table: Table[Any], rig: Rig) -> Iterable[Finding]:
@@ -206,10 +213,12 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
     return {"mu": float(mu), "v_s": float(v_s)} if known else {"mu": float(mu)}
 
 
-def friction_comparison(
-    experiments: "Sequence[FrictionExperiment]", theta: ValuesBySymbol, draws: Sequence[ValuesBySymbol]
-) -> Comparison:
-    """Plot data of friction coefficient against velocity: readings, the paper's curve, this fit (paper, Fig. 2)."""
+def friction_panels(
+    experiments: "Sequence[FrictionExperiment]", values: Values, draws: Sequence[Values]
+) -> tuple[Comparison]:
+    """Friction coefficient against velocity: readings of all experiments, the paper's curve, this fit (paper, Fig. 2)."""
+    # Local values differ in scatters only. Merged, they contain mu and v_s if any experiment has both.
+    theta, *own = ({k: v for e in experiments for k, v in e.local(p).items()} for p in (values, *draws))
     laws = list(dict.fromkeys(e.friction for e in experiments))
     friction = laws[0]
     points = [Points(e.label, *e.paper_points(), role=e.role) for e in experiments]
@@ -223,7 +232,7 @@ def friction_comparison(
 
     curves = []
     for law in laws:
-        lower, upper = band(np.array([curve(law, draw) for draw in draws]))
+        lower, upper = band(np.array([curve(law, draw) for draw in own]))
         name = f"this fit, {law.name}" + (f", {law.direction}" if len(laws) > 1 else "")
         curves.append(Curve(name, speed, curve(law, theta), lower, upper))
     paper = paper_friction_fit(np.concatenate([p.x for p in points]), np.concatenate([p.y for p in points]))
@@ -234,7 +243,7 @@ def friction_comparison(
         distance = slide_distance(friction.coefficient(theta), 1.0 / theta["g"], reading)
         expected = reading**2 / (2.0 * theta["g"] * distance)
         curves.append(Curve("this fit, read as v²/(2gd)", reading, expected, role="alternative"))
-    return Comparison(
+    panel = Comparison(
         "friction",
         "friction",
         "Friction coefficient against velocity",
@@ -243,6 +252,7 @@ def friction_comparison(
         tuple(points),
         tuple(curves),
     )
+    return (panel,)
 
 
 def friction_estimates(experiments: "Sequence[FrictionExperiment]") -> Values:
@@ -250,15 +260,6 @@ def friction_estimates(experiments: "Sequence[FrictionExperiment]") -> Values:
     points = [e.paper_points() for e in experiments]
     speed, coefficient = (np.concatenate(parts) for parts in zip(*points, strict=True))
     return paper_friction_fit(speed, coefficient)
-
-
-def friction_panels(
-    experiments: "Sequence[FrictionExperiment]", values: Values, draws: Sequence[Values]
-) -> tuple[Comparison]:
-    """Return one panel for all friction experiments."""
-    # Local values differ in scatters only. Merged, they contain mu and v_s if any experiment has both.
-    points: list[Values] = [{k: v for e in experiments for k, v in e.local(p).items()} for p in (values, *draws)]
-    return (friction_comparison(experiments, points[0], points[1:]),)
 
 
 # experiment: What friction experiments share, and whether they agree on the surface.
@@ -289,6 +290,7 @@ class FrictionExperiment(PointTest):
 
     role: ClassVar[Literal["static", "dynamic", "sliding"]]
     reads = (FRICTION,)
+    checks = (check_one_surface, check_variants)
 
     def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
         return (
@@ -357,9 +359,6 @@ class FrictionExperiment(PointTest):
         sliding = {} if self.role == "static" else {"v_s": Start(float(np.median(speed)), 0.5)}
         return {"mu": mu, "mu_back": mu, **sliding, self.scatter.symbol: Start(0.02, 0.3)}
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        return friction_comparison([self], theta, draws)
-
 
 # pulls: Forces that overcome friction, at rest or at a held speed.
 
@@ -407,14 +406,9 @@ class Pulls(FrictionExperiment):
         return "force" if "force" in self.readings else "coefficient"
 
     @property
-    def weighed(self) -> bool:
-        """Whether the reading is a force that depends on the masses."""
-        alone = "normal_force" in self.readings and ("slope" not in self.ground or self.of_weights)
-        return self.reading == "force" and not alone
-
-    @property
     def masses(self) -> tuple[str, ...]:
-        return ("m1", "m2") if self.weighed else super().masses
+        alone = "normal_force" in self.readings and ("slope" not in self.ground or self.of_weights)
+        return ("m1", "m2") if self.reading == "force" and not alone else super().masses
 
     @property
     def loads(self) -> tuple[np.ndarray, np.ndarray] | None:

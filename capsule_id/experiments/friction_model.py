@@ -107,12 +107,15 @@ class FrictionModel:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The sampled parameters."""
-        rows = (row for row in self.law.parameters if row.symbol != NORMAL_FORCE)
-        absent = set(CONSTANT) if self.constant else set()
-        if "mu_back" in self.free:
-            absent |= {"forward": {"mu_back"}, "backward": {"mu"}}.get(self.direction, set())
-        sampled = (row for row in rows if not row.optional or row.symbol in self.free)
-        return tuple(row for row in sampled if row.symbol not in absent)
+        unseen = {"forward": "mu_back", "backward": "mu"}.get(self.direction) if "mu_back" in self.free else None
+        return tuple(row for row in self._varied if row.symbol != unseen)
+
+    @property
+    def _varied(self) -> list[Parameter]:
+        """The parameters of the law whose values are neither the normal force nor fixed."""
+        fixed = {NORMAL_FORCE, *(CONSTANT if self.constant else ())}
+        rows = (row for row in self.law.parameters if row.symbol not in fixed)
+        return [row for row in rows if not row.optional or row.symbol in self.free]
 
     @property
     def parameters_at_rest(self) -> tuple[Parameter, ...]:
@@ -166,10 +169,7 @@ class FrictionModel:
 
     def _at(self, theta: ValuesBySymbol, N: Any) -> FrictionLaw:
         # Parameters that tilts do not sample have no effect at rest, so any value is valid there.
-        held = set(CONSTANT) if self.constant else set()
-        rows = (row for row in self.law.parameters if row.symbol not in {NORMAL_FORCE, *held})
-        used = (row for row in rows if not row.optional or row.symbol in self.free)
-        known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in used}
+        known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in self._varied}
         constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
         law = cast(Any, self.law)(**known, **constant, **(CONSTANT if self.constant else {}))
         return Reversed(law) if self.direction == "backward" else law

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import special
 
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.friction import FrictionExperiment, check_one_surface
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior
@@ -63,7 +63,7 @@ class Variant:
         return model_lines(self.model)
 
 
-def candidates(experiments: Sequence[FrictionExperiment]) -> list[FrictionModel]:
+def candidates(experiments: Sequence[Any]) -> list[FrictionModel]:
     """Return the laws that the experiments can tell apart, the law in use included, the simplest first."""
     in_use = replace(experiments[0].friction, direction="both")
     models = [FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",))]
@@ -79,7 +79,7 @@ def candidates(experiments: Sequence[FrictionExperiment]) -> list[FrictionModel]
 class VariantPoints:
     """The paper's points of all friction experiments, and their density under a law."""
 
-    def __init__(self, experiments: Sequence[FrictionExperiment]) -> None:
+    def __init__(self, experiments: Sequence[Any]) -> None:
         self.experiments = tuple(experiments)
         points = [e.paper_points() for e in experiments]
         self.speed = np.concatenate([speed for speed, _ in points])
@@ -238,7 +238,7 @@ def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:
 FEWEST_SLIDES, SEED = 3, 0
 
 
-def check_variants(experiments: Sequence[FrictionExperiment], fit: Fitted) -> list[Finding]:
+def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
     """Compare the friction law in use with other laws, and recommend the simplest that the readings allow.
 
     The law in use fails where another one has a marginal likelihood ``FACTOR`` times larger, or where its residuals are
@@ -284,7 +284,3 @@ def check_variants(experiments: Sequence[FrictionExperiment], fit: Fitted) -> li
         Finding("friction.variants", "fail" if rejected else "ok", {**facts, "alternatives": rows}, parameters=names),
         Finding("friction.order", "fail" if ordered else "ok", facts, parameters=names),
     ]
-
-
-#: Checks of friction experiments.
-CHECKS = (check_one_surface, check_variants)

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from capsule_id.experiments.base import Start, ValuesBySymbol
+from capsule_id.experiments.base import Start, ValuesBySymbol, scatter_prior
 from capsule_id.experiments.checks import LEVEL, refit
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
@@ -19,7 +19,7 @@ from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
 from capsule_id.experiments.point_test import PointTest
-from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import Entry
 from capsule_id.views import Comparison, Curve, Finding, Message, ResultTable
@@ -156,9 +156,7 @@ def lack_of_fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
 # intercept is integrated out under a wide normal prior.
 
 
-#: Default prior of a scatter: log-normal, median 1 % of the range of y, factor 100.
-SCATTER_MEDIAN, SCATTER_FACTOR = 0.01, 100.0
-#: Its factor where the table has too few rows to show any scatter.
+#: Factor of the default prior of a scatter where the table has too few rows to show any.
 SCATTER_FACTOR_OF_FEW = 3.0
 
 
@@ -198,19 +196,14 @@ def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int])
     misfit = line.misfit(theta)
     keep = np.setdiff1d(np.arange(line.n), left_out)
     x, sd = line.x[keep], misfit.sd[keep]
-    if len(keep) < 4 or len(np.unique(x)) < 3:
+    z = (x - np.mean(x)) / (np.ptp(x) or 1.0)
+    if len(keep) < 4 or len(np.unique(np.round(z, 9))) < 3:
         return 0.0, 1.0
-    z = (x - np.mean(x)) / np.ptp(x)
-    columns = np.stack([np.ones_like(z), z, z**2], axis=1) / sd[:, None]
-    y = line.observed[keep] / sd
-    coefficients, *_ = np.linalg.lstsq(columns, y, rcond=None)
-    rest = y - columns @ coefficients
-    covariance = np.linalg.inv(columns.T @ columns)
-    freedom = len(keep) - 3
-    variance = 1.0 if line.scale_known else float(rest @ rest) / max(freedom, 1)
-    score = abs(coefficients[2]) / np.sqrt(max(variance * covariance[2, 2], 1e-300))
-    p = 2.0 * (stats.norm.sf(score) if line.scale_known else stats.t.sf(score, max(freedom, 1)))
-    return float(coefficients[2] * 0.25 / abs(coefficients[1])), float(p)
+    variances = "unscaled" if line.scale_known else True
+    coefficients, covariance = np.polyfit(z, line.observed[keep], 2, w=1.0 / sd, cov=variances)
+    score = abs(coefficients[0]) / np.sqrt(max(covariance[0, 0], 1e-300))
+    p = 2.0 * (stats.norm.sf(score) if line.scale_known else stats.t.sf(score, len(keep) - 3))
+    return float(coefficients[0] * 0.25 / abs(coefficients[1])), float(p)
 
 
 def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
@@ -274,8 +267,8 @@ class Line(PointTest):
         return parameter(self.symbol)
 
     def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
-        slope, factor = self.slope_of(table), SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW
-        prior = Prior("lognormal", SCATTER_MEDIAN * float(np.ptp(self.observed)), factor)
+        slope, prior = self.slope_of(table), scatter_prior(float(np.ptp(self.observed)))
+        prior = prior if self.n > 2 else replace(prior, spread=SCATTER_FACTOR_OF_FEW)
         scatter = replace(parameter("scatter", table.label, prior), unit=self.unit_of_y)
         return (slope,) if self.scale_known else (slope, scatter)
 

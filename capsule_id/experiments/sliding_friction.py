@@ -1,8 +1,5 @@
 """Steady sliding: friction force, or coefficient, at a held speed."""
 
-from collections.abc import Mapping
-from typing import Any
-
 from capsule_id.experiments.friction import (
     CAPTIONS,
     MASSES_OF_FREE,
@@ -16,11 +13,10 @@ from capsule_id.experiments.friction import (
     friction_estimates,
     friction_panels,
     lint_slides,
+    masses_of_pulls,
 )
-from capsule_id.experiments.friction_variants import CHECKS
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Prior, scatter
-from capsule_id.rig.model import Table
 from capsule_id.rig.schema import ColumnRule, Entry
 from capsule_id.rig.toml import POSITIVE
 
@@ -32,43 +28,21 @@ SLIDING_SCATTER = scatter(
 )
 
 
-def _masses(table: Table[PullSettings]) -> tuple[str, ...]:
-    # The force overcomes the weight along the slope too.
-    weighed = "normal_force" not in table.columns or table.settings.load_is == "pressed"
-    return ("m1", "m2") if "force" in table.columns and weighed else ()
-
-
-def _stated_law(entry: Entry[PullSettings]) -> Mapping[str, Any]:
-    """The keys of ``[model]``; none where it is no table, which its own reader refuses."""
-    model = entry.node.document.data.get("model", {})
-    return model if isinstance(model, dict) else {}
-
-
-def _check_speed(entry: Entry[PullSettings]) -> None:
-    """Refuse readings without speeds under a law that depends on the speed.
+def _check_law(entry: Entry[PullSettings]) -> None:
+    """Refuse readings without speeds under a law that depends on the speed, and a viscous part beside normal forces of rows.
 
     Raises
     ------
     InputError
         At the entry.
     """
-    law = _stated_law(entry)
-    if "speed" in entry.table.columns or (law.get("friction") == "constant" and "viscous" not in law.get("free", [])):
-        return
-    rule = "sliding readings without a speed need a friction that does not depend on it"
-    remedy = 'add the column speed, or write friction = "constant" in [model]'
-    raise entry.error("", rule, " ".join(entry.table.columns), remedy)
-
-
-def _check_viscous(entry: Entry[PullSettings]) -> None:
-    """Refuse a viscous part beside normal forces of every row.
-
-    Raises
-    ------
-    InputError
-        At the entry.
-    """
-    if "normal_force" in entry.table.columns and "viscous" in _stated_law(entry).get("free", []):
+    columns, model = entry.table.columns, entry.node.document.data.get("model", {})
+    law = model if isinstance(model, dict) else {}  # its own reader refuses another type
+    if "speed" not in columns and (law.get("friction") != "constant" or "viscous" in law.get("free", [])):
+        rule = "sliding readings without a speed need a friction that does not depend on it"
+        remedy = 'add the column speed, or write friction = "constant" in [model]'
+        raise entry.error("", rule, " ".join(columns), remedy)
+    if "normal_force" in columns and "viscous" in law.get("free", []):
         rule = "a column normal_force and a viscous part are not fitted together"
         raise entry.error("", rule, "both", "make an experiment with its own N0 of each load, or remove viscous")
 
@@ -97,8 +71,8 @@ KIND = Kind(
     optional=("normal_force",),
     settings=PullSettings,
     meant=("sliding", "break-away", "no pull"),
-    rules=(check_normal_force, _check_speed, _check_viscous, check_load),
-    masses=_masses,
+    rules=(check_normal_force, _check_law, check_load),
+    masses=masses_of_pulls,
     masses_of_free=MASSES_OF_FREE,
     parameters=(SLIDING_SCATTER,),
     make=made_by("capsule_id.experiments.sliding_friction:SlidingFriction"),
@@ -120,4 +94,3 @@ class SlidingFriction(Pulls):
     """Steady sliding. Without a speed the friction must not depend on it."""
 
     role, scatter = "sliding", SLIDING_SCATTER
-    checks = CHECKS

@@ -20,9 +20,9 @@ from capsule_id.experiments.friction import (
     check_scatter,
     friction_estimates,
     friction_panels,
+    masses_of_pulls,
 )
 from capsule_id.experiments.friction_model import FrictionModel
-from capsule_id.experiments.friction_variants import CHECKS
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
@@ -91,13 +91,6 @@ def _check_ground(entry: Entry[TiltSettings]) -> None:
         raise entry.error("N0", "normal_force holds N0 too", "both", "remove N0, or normal_force", of_key=True)
 
 
-def _masses(table: Table[TiltSettings]) -> tuple[str, ...]:
-    # The pull overcomes the weight along the slope too.
-    stated = table.settings.normal_force is not None or "normal_force" in table.columns
-    weighed = not stated or table.settings.load_is == "pressed"
-    return ("m1", "m2") if "force" in table.columns and weighed else ()
-
-
 def tilts(
     rng: np.random.Generator, mu: float, trials: int = TRIALS, tilt_sd: float = TRIAL_SD
 ) -> dict[str, np.ndarray]:
@@ -137,7 +130,7 @@ KIND = Kind(
     },
     sets=(("angle",), ("height", "length"), ("force",)),
     optional=("normal_force",),
-    masses=_masses,
+    masses=masses_of_pulls,
     settings=TiltSettings,
     meant=("break-away", "sliding", "no pull"),
     rules=(check_normal_force, _check_tilt, _check_ground, check_load),
@@ -168,7 +161,6 @@ class StaticFriction(FrictionExperiment):
     """
 
     role, reading, scatter, relative, on_track = "static", "angle", TILT_SD, False, False
-    checks = CHECKS
 
     @classmethod
     def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> tuple[FrictionExperiment, ...]:
@@ -209,4 +201,3 @@ class StaticPulls(Pulls):
     """Pulls along the track until the capsule slips."""
 
     role, scatter = "static", PULL_SCATTER
-    checks = CHECKS

@@ -234,35 +234,30 @@ def _check_turns(table: Table[DecaySettings]) -> None:
 
 def _make(table: Table[DecaySettings], rig: Rig, friction: Any) -> tuple[Any, ...]:
     """Make the experiment of the class that the settings demand; its record begins with the release."""
+    record = table.settings.samples == "record"
     make = made_by(
-        "capsule_id.experiments.free_vibration.experiment:FreeVibration",
+        f"capsule_id.experiments.free_vibration.{'experiment:FreeVibration' if record else 'turning_points:TurningPoints'}",
         capsule="capsule_id.experiments.capsule_experiment:CapsuleDecay",
     )
-    if table.settings.samples == "turning_points":
-        make = made_by("capsule_id.experiments.free_vibration.turning_points:TurningPoints")
     table = cut_at_release(table)
-    if DecayModel.stated(table.settings).slow and table.settings.samples == "record":
+    if DecayModel.stated(table.settings).slow and record:
         table = first_periods(table)
-    return tuple(e for one in _channel_tables(table) for e in make(one, rig, friction))
-
-
-def _channel_tables(table: Table[DecaySettings]) -> list[Table[DecaySettings]]:
-    """Return a table for each channel; its fit has initial conditions of its own, which loses little."""
-    names = [name for name in CHANNELS if name in table.columns]
-    return [
+    # The fit of each channel has initial conditions of its own, which loses little.
+    parts = [
         replace(
             table,
             columns={own: table.columns[own] for own in ("time", name)},
-            label=table.label if name == names[0] else f"{table.label}_{name}",
+            label=table.label if name == channel_of(table) else f"{table.label}_{name}",
         )
-        for name in names
+        for name in CHANNELS
+        if name in table.columns
     ]
+    return tuple(e for part in parts for e in make(part, rig, friction))
 
 
 def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
     """Symbols of the required masses: the rod, and the capsule where it may move."""
-    moves = table.settings.capsule == "free" or table.settings.forward == "capsule"
-    return ("m1", "m2") if moves else ("m1",)
+    return ("m1", "m2") if table.settings.capsule == "free" or table.settings.forward == "capsule" else ("m1",)
 
 
 def _paper(experiments: Sequence[Any]) -> Values:

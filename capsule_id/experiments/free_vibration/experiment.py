@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks import LEVEL, refit
 from capsule_id.experiments.context import Check, Fitted
 from capsule_id.experiments.free_vibration.decrement import equilibrium
@@ -29,8 +29,8 @@ from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding, Level, ResultTable
 
-#: Joint sds apart from which halves of a record disagree, and from which that fails.
-HALVES_DISAGREE, HALVES_FAIL = 3.0, 4.0
+#: Joint sds apart from which halves of a decay disagree or a force is seen, and from which that fails.
+DISAGREE, FAIL = 3.0, 4.0
 #: Fewest readings and half cycles of a half; fewest half cycles that a later start leaves.
 FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
@@ -130,7 +130,7 @@ def halves(changes: Changes) -> Check:
         name = max(found, key=lambda name: abs(found[name][2]))
         first, second, z, matters = found[name]
         facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
-        level = "ok" if not abs(z) > HALVES_DISAGREE else "fail" if abs(z) > HALVES_FAIL and matters else "warn"
+        level = "ok" if not abs(z) > DISAGREE else "fail" if abs(z) > FAIL and matters else "warn"
         return {**facts, "model": e.model_name, "stated": e.stated_words}, level
 
     return each("decays.halves", judge)
@@ -360,8 +360,15 @@ class FreeVibration(DecayRecord):
     )
     tables = (decay_table, damping_table)
 
-    second_models = staticmethod(second_models)
-    starts, nested_starts = decay_starts, nested_starts
+    @classmethod
+    def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
+        return second_models(records, readings)
+
+    def starts(self) -> dict[str, Start]:
+        return decay_starts(self)
+
+    def nested_starts(self) -> Sequence[Mapping[str, float]]:
+        return nested_starts(self)
 
     def noise_facts(self) -> Facts:
         facts = {"present": self.model.additions, "second": self.replaced, "lines": self.lines}

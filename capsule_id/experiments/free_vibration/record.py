@@ -20,6 +20,7 @@ from capsule_id.experiments.base import (
     axis_label,
     band,
     clock_parameters,
+    scatter_prior,
     stated_rate,
     stretch,
 )
@@ -169,8 +170,6 @@ def averaged_process(times: ReadingTimes, correlation_time: Any) -> SymmQSM:
 # decay: What the records and the turning points of a decay have in common, and one record.
 
 
-#: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
-NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
 #: Twice the damping ratio up to which an even record is summed in closed form.
 UNIFORM = 0.6
 #: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
@@ -379,12 +378,17 @@ class DecayRecord(Decay):
         period of the decay and the square of the record's length over it.
         """
         label, length, root = self.table.label, float(np.ptp(self.time)), float(np.sqrt(len(self.time)))
-        rows = [parameter("k1"), parameter("c"), self.channel.noise.named(label, self.noise_prior())]
+        periods = length * self.rough.Omega_o / (2.0 * np.pi)
+        rows = [
+            parameter("k1"),
+            parameter("c"),
+            self.channel.noise.named(label, scatter_prior(float(np.ptp(self.values)))),
+        ]
         shapes = {
             "noise_time": NOISE_TIME.named(label, Prior("lognormal", length / root, root)),
             "white_ratio": WHITE_RATIO.named(label),
             "drift_ratio": DRIFT_RATIO.named(label),
-            "drift_time": DRIFT_TIME.named(label, Prior("lognormal", 0.3 * length, max(3.0, 0.3 * self.cycles[-1]))),
+            "drift_time": DRIFT_TIME.named(label, Prior("lognormal", 0.3 * length, max(3.0, 0.3 * periods))),
         }
         rows += [shapes[symbol] for symbol in self.model.shapes]
         if not self.closed:
@@ -406,10 +410,6 @@ class DecayRecord(Decay):
     @property
     def own_symbols(self) -> tuple[str, ...]:
         return () if self.closed else ("amplitude", "turning_time")
-
-    def noise_prior(self) -> Prior:
-        """Default prior of the record's noise sd, m."""
-        return Prior("lognormal", NOISE_MEDIAN * float(np.ptp(self.values)), NOISE_FACTOR)
 
     @property
     def scatters(self) -> tuple[str]:

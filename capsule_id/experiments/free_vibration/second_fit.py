@@ -25,6 +25,7 @@ from capsule_id.experiments.free_vibration.models import (
 )
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
+    FEWEST_PER_PERIOD,
     MOST_PERIODS,
     DecayModel,
     block_mean,
@@ -397,8 +398,8 @@ class Screening:
 
 #: Records are thinned to this many readings per period before their models are ranked.
 READINGS_PER_PERIOD = 16
-#: Fewest readings per period of a thinned record, and in all of it.
-FEWEST_PER_PERIOD, FEWEST_READINGS = 8, 80
+#: Fewest readings of a thinned record.
+FEWEST_READINGS = 80
 #: Largest number of samples of a record that is no free decay.
 LONGEST_UNCUT = 1000
 #: Of forces whose BIC differs by less, the fewest are chosen: with seven alternatives, noise alone often gains this much.

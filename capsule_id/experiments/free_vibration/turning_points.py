@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, stated_rate, stretch
+from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, scatter_prior, stated_rate, stretch
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
-from capsule_id.experiments.free_vibration.experiment import each, halves
+from capsule_id.experiments.free_vibration.experiment import DISAGREE, FAIL, each, halves
 from capsule_id.experiments.free_vibration.hidden_terms import (
     check_hidden_terms,
     further_sensitivities,
@@ -37,8 +37,6 @@ from capsule_id.views import Facts, Finding, Level
 #     -> Student's t of that force, or of the differences between the halves
 
 
-#: Joint sds from which halves disagree or a force is present, and from which that fails, as for records.
-DISAGREE, FAIL = 3.0, 4.0
 #: Fewest turning points that are judged.
 FEWEST_TURNS = 8
 #: Passes that estimate the noise levels.
@@ -156,26 +154,17 @@ def least_squares(
     columns: Float[np.ndarray, "m p"], y: Float[np.ndarray, " m"], n: int
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"], float]:
     """Coefficients, their sds, and degrees of freedom; the first n rows and the others each have one noise level."""
-    size = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
-    found, scaled, freedom = _weighted(columns / size, y, n)
-    return found / size, np.linalg.norm(np.linalg.pinv(scaled), axis=1) / size, float(np.min(freedom))
-
-
-def _weighted(
-    columns: Float[np.ndarray, "m p"], y: Float[np.ndarray, " m"], n: int
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "m p"], Float[np.ndarray, "2"]]:
-    """Coefficients, weighted columns, and degrees of freedom of the first n rows and of the others."""
-    group = np.repeat([0, 1], [n, len(y) - n])
+    size, group = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny), np.repeat([0, 1], [n, len(y) - n])
     noise = np.array([np.std(y[group == one]) for one in (0, 1)])
     for _ in range(PASSES):
         weight = 1.0 / np.maximum(noise, 1e-12 * np.max(np.abs(y)))[group]
-        scaled = columns * weight[:, None]
+        scaled = columns / size * weight[:, None]
         found = np.linalg.lstsq(scaled, weight * y, rcond=None)[0]
         # Leverages share the degrees of freedom out between positions and times.
         leverage = np.sum(np.linalg.qr(scaled)[0] ** 2, axis=1)
         freedom = np.maximum(np.bincount(group, 1.0 - leverage), 0.5)
-        noise = np.sqrt(np.bincount(group, (y - columns @ found) ** 2) / freedom)
-    return found, scaled, freedom
+        noise = np.sqrt(np.bincount(group, (y - columns / size @ found) ** 2) / freedom)
+    return found / size, np.linalg.norm(np.linalg.pinv(scaled), axis=1) / size, float(np.min(freedom))
 
 
 def _cost(e: "TurningPoints", theta: ValuesBySymbol) -> float:
@@ -258,8 +247,9 @@ def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, str, float]
         offered = [symbol for symbol in z if z[symbol] > FAIL and (cubic or symbol != "k_cubic")]
         best = max(offered, key=lambda symbol: z[symbol], default="")
         rivals = (symbol for symbol in z if symbol != best and z[symbol] > RIVAL)
+        others = (e.with_model(e.model.with_force(symbol)) for symbol in rivals)
         # It is demanded beside an offset, and beside every other force.
-        if best and _demands(e, theta, best, offset=True) and all(_demands_beside(e, one, best) for one in rivals):
+        if best and _demands(e, theta, best, offset=True) and all(_demands(one, fitted(one), best) for one in others):
             found.append((e.label, best, z[best]))
     return max(found, key=lambda one: one[2], default=None)
 
@@ -270,17 +260,7 @@ def _demands(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset: boo
     return force is not None and force["z"] > DISAGREE
 
 
-def _demands_beside(e: "TurningPoints", other: str, symbol: str) -> bool:
-    """Whether the readings demand the force with the parameter ``symbol`` even beside the force ``other``."""
-    with_other = e.with_model(e.model.with_force(other))
-    return _demands(with_other, fitted(with_other), symbol)
-
-
 # experiment: Turning points of a free decay, read one by one: times and positions (``samples = "turning_points"``).
-
-
-#: Default priors of the noise of positions and times: log-normal, this fraction of the range and of the median step.
-NOISE_FRACTION, NOISE_FACTOR = 0.01, 100.0
 
 
 class TurningPoints(Decay):
@@ -331,8 +311,6 @@ class TurningPoints(Decay):
             for column, step in zip(columns, self.steps, strict=True)
         ]
         self.reading_sd, self.time_reading_sd = errors
-        scales = float(np.ptp(self.values)), float(np.median(step))
-        noise = [Prior("lognormal", NOISE_FRACTION * scale, NOISE_FACTOR) for scale in scales]
         self.clock_rate = stated_rate(table)
         self.about = DecayAbout(table, rig, ())
         rough = self.paper_decrement()
@@ -340,8 +318,8 @@ class TurningPoints(Decay):
         rows += further_parameters(self.model.symbols, rough.k1, self.mass, float(np.max(np.abs(rough.peaks))))
         rows += [
             AMPLITUDE.named(table.label, Prior("lognormal", abs(float(rough.peaks[0])), NUISANCE_WIDTH)),
-            NOISE_SD.named(table.label, noise[0]),
-            TIME_SD.named(table.label, noise[1]),
+            NOISE_SD.named(table.label, scatter_prior(float(np.ptp(self.values)))),
+            TIME_SD.named(table.label, scatter_prior(float(np.median(step)))),
             *clock_parameters(table, rig),
         ]
         self.about = DecayAbout(table, rig, tuple(rows), screened, rough)
@@ -397,6 +375,6 @@ class TurningPoints(Decay):
             "c": Start(c, 0.2),
             **{symbol: forces[symbol] for symbol in self.model.symbols},
             f"amplitude[{self.label}]": Start(size, 0.02),
-            f"noise_sd[{self.label}]": Start(0.3 * NOISE_FRACTION * float(np.ptp(self.values)), 0.3),
-            f"time_sd[{self.label}]": Start(0.1 * NOISE_FRACTION * float(np.median(np.diff(self.time))), 0.3),
+            f"noise_sd[{self.label}]": Start(0.003 * float(np.ptp(self.values)), 0.3),
+            f"time_sd[{self.label}]": Start(0.001 * float(np.median(np.diff(self.time))), 0.3),
         }
