@@ -19,7 +19,6 @@ from capsule_id.rig.formats.raw import (
     Layout,
     Place,
     TextFile,
-    occurrences,
     refuse_line,
     refuse_wide,
 )
@@ -107,11 +106,8 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
 
 def _file(content: Content, path: Path, layout: Layout) -> TextFile:
     """The text down to ``data_to_line``, where that is stated."""
-    whole, last = TextFile(content, path), layout.data_to_line
-    if last is None:
-        return whole
-    number = sum(occurrences("\n", text) for _, text in whole.blocks())
-    if last > number:
+    file, last = TextFile(content, path, layout.data_to_line), layout.data_to_line or 0
+    if last and last > (number := sum(text.count(b"\n") for _, text in file.blocks())):
         raise InputError(
             f"data_to_line must be a line of the file, which has {number}",
             str(last),
@@ -120,7 +116,7 @@ def _file(content: Content, path: Path, layout: Layout) -> TextFile:
             max(number, 1),
             1,
         )
-    return TextFile(content, path, last)
+    return file
 
 
 def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -178,7 +179,7 @@ class TextFile:
             begin, end = end, self._text.find(b"\n", end + BLOCK) + 1 or len(self._text)
             block = self._text[begin:end]
             text = block if block.endswith(b"\n") else block + b"\n"
-            lines = occurrences("\n", text)
+            lines = text.count(b"\n")
             if self.last is not None and number + lines > self.last:
                 lines = self.last - number
                 text = b"\n".join([*text.split(b"\n", lines)[:-1], b""]) if lines else b""
@@ -202,15 +203,12 @@ def _bytes_of(content: Content, path: Path) -> bytes:
     """The bytes of a text, decompressed."""
     if path.suffix.lower() != COMPRESSED:
         return whole(content)
-    found, size = list[bytes](), 0
-    with gzip.open(io.BytesIO(content) if isinstance(content, bytes) else content) as file:
-        while True:
-            with complete(path, "compress it again by gzip"):
-                found.append(file.read(BLOCK))
-            size += len(found[-1])
-            refuse_large(size, content, path)
-            if not found[-1]:
-                return b"".join(found)
+    found = list[bytes]()
+    with complete(path, "compress it again by gzip"), gzip.open(io.BytesIO(whole(content))) as file:
+        for block in iter(partial(file.read, BLOCK), b""):
+            found.append(block)
+            refuse_large(sum(map(len, found)), content, path)
+    return b"".join(found)
 
 
 def _encoding(raw: bytes, path: Path) -> str:
@@ -250,11 +248,6 @@ def _encoding(raw: bytes, path: Path) -> str:
             *place_of_byte(raw[:wrong], codec),
         )
     return WINDOWS
-
-
-def occurrences(mark: str, text: bytes) -> int:
-    """How often an ASCII character occurs; faster than ``count`` where it is frequent."""
-    return int(np.count_nonzero(np.frombuffer(text, np.uint8) == ord(mark)))
 
 
 def lines_of(text: bytes) -> list[str]:
@@ -297,11 +290,6 @@ class RawTable:
     missing: int = 0
     other: int = 0
     rejected: int = 0
-
-    @property
-    def values(self) -> np.ndarray:
-        """A copy of the numbers, (rows, columns)."""
-        return np.column_stack(self.columns)
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""

@@ -54,7 +54,7 @@ def outcome(text: str, suffix: str, layout: Layout | None) -> list[str]:
     try:
         if layout is None:
             raw = READERS[suffix](text.encode(), path)
-            return [repr((raw.names, raw.units, raw.values.tolist(), raw.rows.tolist(), raw.place(0, 0), raw.encoding))]
+            return [repr((raw.names, raw.units, [c.tolist() for c in raw.columns], raw.rows.tolist(), raw.place(0, 0), raw.encoding))]
         export = EXPORTS[suffix](text.encode(), path, layout)
     except InputError as error:
         return [str(error)]
