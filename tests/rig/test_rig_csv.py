@@ -46,6 +46,7 @@ def test_round_trip(delimiter: str, decimal: str, ending: str, mark: str, column
 
 def test_cell_by_cell_reading_agrees_with_the_fast_one() -> None:
     values = numbers(500, 2, seed=8)
+    values = values[np.abs(values).min(axis=1) > 1e-300]  # below it the cells are always read one by one
     lines = ["a [m];b [s]", *(f"{a!r}; +{abs(b)!r} " for a, b in values.tolist())]
     shape = Shape(1, ";", 2, ".")
     fast = cast(np.ndarray, plain_block("\n".join([*lines[1:], ""]).encode(), shape, [0, 1]))

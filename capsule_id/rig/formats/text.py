@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Content, Place, RawTable, TextFile, lines_of, refuse_wide
+from capsule_id.rig.formats.raw import Place, RawTable, TextFile, lines_of, refuse_wide
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -399,12 +399,12 @@ class MissingCellsError(InputError):
         self.texts = texts
 
 
-def read_csv(content: Content, path: Path) -> RawTable:
+def read_csv(content: bytes, path: Path) -> RawTable:
     """Read a CSV table.
 
     Parameters
     ----------
-    content : the bytes of the file, or where they lie
+    content : the bytes of the file
     path : its name, for error lines
 
     Raises
