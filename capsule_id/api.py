@@ -1,11 +1,10 @@
 """What the commands do, as functions, and the finished fit that they return."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import MISSING, dataclass, fields
 from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -45,7 +44,7 @@ from capsule_id.physics.model import CapsuleParameters, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.report.columns import sampled_parameters, table_rows, table_text, verdict_text, wrapped
 from capsule_id.report.figures import fits as figures
-from capsule_id.report.figures.style import figure_of, subfigure_at
+from capsule_id.report.figures.style import subfigure_at
 from capsule_id.report.html import summary_html
 from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.netcdf import data_tree
@@ -214,27 +213,27 @@ class Fit(Result):
 
     def plot_comparison(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Readings with the predicted curve and its 95 % band; ``label`` as in ``comparisons``, by default the first."""
-        return _drawn(figures.comparison, _named(self.comparisons, label, attrgetter("label")), ax)
+        return _drawn(figures.comparison, _named(self.comparisons, label), ax)
 
     def plot_residuals(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Residuals of the point fit in units of the noise; ``label``: by default the first panel that has some."""
         panels = [panel for panel in self.comparisons if panel.residuals is not None]
-        return _drawn(figures.residuals, _named(panels, label, attrgetter("label")), ax, height=2.4)
+        return _drawn(figures.residuals, _named(panels, label), ax, height=2.4)
 
     def plot_autocorrelation(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Autocorrelation of the residuals of a record; ``label``: by default the first record."""
         panels = [panel for panel in self.comparisons if panel.autocorrelation is not None]
-        return _drawn(figures.autocorrelation, _named(panels, label, attrgetter("label")), ax, height=2.4)
+        return _drawn(figures.autocorrelation, _named(panels, label), ax, height=2.4)
 
     def plot_record(self, name: str | None = None, ax: Axes | None = None) -> Figure:
         """Channels of a recorded run and its phase plane, several panels in the place of ``ax``: the figure."""
-        view = _named(self.records, name, attrgetter("name")).view
+        view = _named(self.records, name, "name").view
         return _drawn_in_panels(figures.overview, view, ax, *figures.overview_size(view))
 
     def plot_force(self, name: str | None = None, ax: Axes | None = None) -> Axes:
         """Force on the rod from the recorded current, and the fitted drive."""
         records = [record for record in self.records if record.view.force is not None]
-        return _drawn(figures.force_on_rod, _named(records, name, attrgetter("name")), ax)
+        return _drawn(figures.force_on_rod, _named(records, name, "name"), ax)
 
     def plot_corner(self, ax: Axes | None = None) -> Figure:
         """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair, in the place of ``ax``: the figure."""
@@ -299,13 +298,12 @@ def compare(a: Result, b: Result) -> pd.DataFrame:
     return frame
 
 
-def _named(items: Iterable[Item], label: str | None, label_of: Callable[[Item], str]) -> Item:
-    """The item with this label; the first one where ``label`` is None."""
-    known: Sequence[Item] = tuple(items)
-    for item in known:
-        if label in (None, label_of(item)):
+def _named(items: Sequence[Item], label: str | None, attribute: str = "label") -> Item:
+    """The item with this label, which is its ``attribute``; the first one where ``label`` is None."""
+    for item in items:
+        if label in (None, getattr(item, attribute)):
             return item
-    names = ", ".join(label_of(item) for item in known)
+    names = ", ".join(getattr(item, attribute) for item in items)
     rule, remedy = (
         "the result must have this panel",
         f"choose from {names}" if names else "fit experiments that have it",
@@ -333,10 +331,9 @@ def _drawn_in_panels(
     draw: Callable[[Any, SubFigure], None], data: object, ax: Axes | None, width: float, height: float
 ) -> Figure:
     """The figure with several panels of ``data`` in the place of ``ax``, or a new pyplot figure."""
-    ax = ax or _new_axes(width, height, None)
-    figure = figure_of(ax)
-    draw(data, subfigure_at(ax))
-    return figure
+    part = subfigure_at(ax or _new_axes(width, height, None))
+    draw(data, part)
+    return part.figure
 
 
 # api: What the commands do, as functions: read a rig folder, fit it, load the result.

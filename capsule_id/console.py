@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from capsule_id.errors import OutputError, printable
+from capsule_id.errors import InputError, OutputError, printable
 
 # interruption: Interruptions by Ctrl-C or SIGTERM: the handler sets a flag, long computations read it between their
 # steps.
@@ -212,6 +212,25 @@ def _discard(error: OSError) -> None:
 def one_line(error: BaseException) -> str:
     """Type and message of an exception, at most ``LONGEST_MESSAGE`` characters."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_MESSAGE]
+
+
+@contextmanager
+def refusing_damage(rule: str, remedy: str, path: Path, shown: Callable[[Exception], str] = one_line) -> Iterator[None]:
+    """Turn every exception of the body about a damaged file into an error line.
+
+    Libraries document no list of exceptions for damaged files, and fuzzing finds most of Python's.
+
+    Raises
+    ------
+    InputError
+        Where the body raises an exception; an ``InputError`` passes unchanged.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(rule, shown(error), remedy, path) from error
 
 
 def save_traceback(error: BaseException) -> str:

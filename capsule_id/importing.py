@@ -389,9 +389,9 @@ def _description(found: FoundLayout, content: bytes) -> str:
     """Rows and separator of a file in words."""
     rows = len(found.export.lines)
     text = counted(rows, "row")
-    if found.path.suffix.lower() not in (".csv", ".txt", ".tsv", ".dat"):
+    if found.export.path.suffix.lower() not in (".csv", ".txt", ".tsv", ".dat"):
         return text
-    line = TextFile(content, found.path).line(int(found.export.lines[0]) - 1)
+    line = TextFile(content, found.export.path).line(int(found.export.lines[0]) - 1)
     return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
 
 

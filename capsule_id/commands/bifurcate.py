@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from capsule_id.commands import PATH
 from capsule_id.commands.capsule_options import (
     DEFAULTS,
@@ -32,7 +34,6 @@ from capsule_id.rig.units import UnitError, factor_to_si
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
-    import numpy as np
     import xarray as xr
     from distributed import Client
     from matplotlib.figure import Figure
@@ -147,10 +148,8 @@ class Axis:
     unit: str
     factor: float
 
-    def values(self) -> "np.ndarray":
+    def values(self) -> np.ndarray:
         """(points,), SI (f in Hz)."""
-        import numpy as np
-
         return np.linspace(self.begin, self.end, self.points) * self.factor
 
 
@@ -301,15 +300,13 @@ def _measured_points(
     args: argparse.Namespace, rig: Rig, axes: Sequence[Axis], values: dict[str, float]
 ) -> "Sequence[MeasuredPoint]":
     """The forced runs with the settings of a diagram. Standard error lists the omitted runs."""
-    from capsule_id.commands.measured_runs import Span, overlay
+    from capsule_id.commands.measured_runs import overlay
 
     diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
     if not diagram or not rig.has_runs:
         return ()
-    x = axes[0].values()
     by_name = args.spring if args.k2 is None else None
-    span = Span(axes[0].name, x[0], x[-1])
-    motions, sentence = overlay(rig, span, values, fitted_values(args.result), by_name)
+    motions, sentence = overlay(rig, axes[0].name, axes[0].values(), values, fitted_values(args.result), by_name)
     complain(sentence)
     return motions
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from capsule_id.commands import PATH, Option
+from capsule_id.console import refusing_damage
 from capsule_id.errors import InputError
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, by_index
 
 if TYPE_CHECKING:
     from capsule_id.physics.drive import Excitation
@@ -55,6 +56,7 @@ def capsule_values(
         If a value is missing, no number or not admissible, belongs to another drive, or the result cannot be read.
     """
     fitted = leaves_of(fitted_values(args.result), args.spring) if args.result is not None else {}
+    known = {**dict.fromkeys(free, 1.0), **defaults, **fitted}
     values = {}
     own = {*CAPSULE_LEAVES, *DRIVES[args.drive]}
     for name, leaf in LEAVES.items():
@@ -63,11 +65,9 @@ def capsule_values(
             if text is not None:
                 raise InputError(f"the {args.drive} drive has no {name}", f"--{name}", "remove it, or change --drive")
             continue
-        value = fitted.get(name, defaults.get(name)) if text is None else math.inf
+        value = known.get(name) if text is None else math.inf
         if text is not None and not (text == "inf" and leaf.may_be_infinite):
             value = number(name, text)
-        if value is None and name in free:
-            value = 1.0
         if value is None and isinstance(leaf.default, str):
             continue
         if value is None:
@@ -128,17 +128,11 @@ def fitted_values(directory: Path) -> dict[str, float]:
         If the file cannot be read.
     """
     file = directory / "parameters.json"
-    try:
+    rule, remedy = "--result takes a result of fit-params", "run fit-params first, or check the path"
+    with refusing_damage(rule, remedy, file, lambda error: type(error).__name__):
         saved = json.loads(file.read_text(encoding="utf-8"))
         values = {name: float(row["map"]) for name, row in saved["parameters"].items()}
         law = str(saved.get("provenance", {}).get("friction", EQUATION_1))
-    except Exception as error:  # a damaged file raises any
-        raise InputError(
-            "--result takes a result of fit-params",
-            type(error).__name__,
-            "run fit-params first, or check the path",
-            file,
-        ) from None
     # The fitted values hold the free parameters of eq. (1) too.
     if law.split(",")[0] != EQUATION_1:
         rule = "the commands compute with eq. (1), and --result must have been fitted with it"
@@ -155,12 +149,12 @@ def leaves_of(fitted: Mapping[str, Value], spring: str | None, file: str | Path 
         If ``spring`` was not fitted.
     """
     leaves = {name: value for name, value in fitted.items() if name in LEAVES}
-    springs = [name[3:-1] for name in fitted if name.startswith("k2[")]
+    springs = by_index("k2", fitted)
     if spring is None and len(springs) == 1:
-        spring = springs[0]
+        spring = next(iter(springs))
     if spring is not None:
         if spring not in springs:
             remedy = f"choose from {', '.join(springs)}" if springs else "give --k2 instead"
             raise InputError("--spring must be a fitted spring", spring, remedy, file)
-        leaves["k2"] = fitted[f"k2[{spring}]"]
+        leaves["k2"] = springs[spring]
     return leaves

@@ -1,7 +1,6 @@
 """Selects the measured forced runs of a rig for a diagram of the model: those with the settings of the diagram."""
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -15,25 +14,23 @@ from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import counted
 
 #: A setting agrees with the diagram within this relative difference, or within this many of its own sds.
-RELATIVE_TOLERANCE: Mapping[str, float] = {"k2": 0.05, "G": 0.05, "P_d": 0.05, "Omega": 0.005}
+RELATIVE_TOLERANCE: Mapping[str, float] = dict.fromkeys(("k2", "G", "P_d"), 0.05) | {"Omega": 0.005}
 TOLERANCE_SDS = 3.0
 
 
-class Span(NamedTuple):
-    """The range of a diagram: symbol, smallest and largest value, SI (f in Hz)."""
-
-    name: str
-    low: float
-    high: float
-
-
 def overlay(
-    rig: Rig, span: Span, values: Mapping[str, float], fitted: Mapping[str, float], spring: str | None = None
+    rig: Rig,
+    over: str,
+    x: Sequence[float] | np.ndarray,
+    values: Mapping[str, float],
+    fitted: Mapping[str, float],
+    spring: str | None = None,
 ) -> tuple[list[MeasuredPoint], str]:
-    """The forced runs of ``rig`` on a diagram over ``span``, and a line with their number and the reasons for the others.
+    """The forced runs of ``rig`` on a diagram over a quantity, and a line with their number and the reasons for the others.
 
     Parameters
     ----------
+    over, x : the swept quantity by symbol, and its values from the smallest to the largest one, SI (f in Hz)
     values : of the diagram by symbol, SI; that of the swept quantity is ignored
     fitted : fitted values by name (K, k2[<spring>]); defaults are the paper's estimate, then the median of the prior
     spring : its name, if the k2 of the diagram was chosen by name; None compares stiffnesses
@@ -59,7 +56,7 @@ def overlay(
         if table.settings.drive == "base" or table.settings.spring is None:
             found = "no harmonic force, or no support spring"
         else:
-            found = _point_or_reason(table, _settings(table, known), span, values, spring)
+            found = _point_or_reason(table, _settings(table, known), over, x, values, spring)
         if isinstance(found, str):
             left_out.append(f"{table.label} ({found})")
         else:
@@ -71,12 +68,13 @@ def overlay(
 def _point_or_reason(
     table: Table[RunSettings],
     settings: Mapping[str, Quantity],
-    span: Span,
+    over: str,
+    x: Sequence[float] | np.ndarray,
     values: Mapping[str, float],
     spring: str | None,
 ) -> MeasuredPoint | str:
     """The run as a point of the diagram, or the reason for its omission."""
-    swept = "Omega" if span.name == "f" else span.name
+    swept = "Omega" if over == "f" else over
     if swept not in settings:
         return f"{swept} is not a setting of a run"
     by_name = spring is not None and swept != "k2"
@@ -90,9 +88,9 @@ def _point_or_reason(
         allowed = max(RELATIVE_TOLERANCE[name] * abs(values[name]), TOLERANCE_SDS * quantity.sd)
         if name != swept and abs(quantity.value - values[name]) > allowed:
             return f"{name} = {quantity.value:.4g}, not {values[name]:.4g} {SWEPT[name].unit}"
-    value = settings[swept].value / (2.0 * np.pi if span.name == "f" else 1.0)
-    if not span.low <= value <= span.high:
-        return f"{span.name} = {value:.4g} {SWEPT[span.name].unit} is outside the diagram"
+    value = settings[swept].value / (2.0 * np.pi if over == "f" else 1.0)
+    if not x[0] <= value <= x[-1]:
+        return f"{over} = {value:.4g} {SWEPT[over].unit} is outside the diagram"
     motion = measured_motion(table)
     if not np.isfinite(motion.mean_velocity):
         return "x_capsule was not recorded"

@@ -6,8 +6,7 @@ import math
 from typing import Any
 
 from capsule_id.commands import PATH
-from capsule_id.console import one_line, say
-from capsule_id.errors import InputError
+from capsule_id.console import refusing_damage, say
 
 OPTIONS = {
     "": (
@@ -26,13 +25,10 @@ def run(args: argparse.Namespace) -> int:
         If DIR holds no result.
     """
     path = args.directory / "parameters.json"
-    try:
+    remedy = "run fit-params again" if path.is_file() else "run fit-params first"
+    with refusing_damage("DIR must be a result of fit-params", remedy, path):
         text = path.read_text(encoding="utf-8")
         shown, clean = _shown(json.loads(text))
-    except Exception as error:  # a damaged file raises any
-        rule = "DIR must be a result of fit-params"
-        remedy = "run fit-params again" if path.is_file() else "run fit-params first"
-        raise InputError(rule, one_line(error), remedy, path) from error
     say(text.rstrip() if args.json else shown)
     return 0 if clean else 3
 

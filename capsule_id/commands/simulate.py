@@ -5,6 +5,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from capsule_id.commands import PATH
 from capsule_id.commands.capsule_options import capsule_and_drive, capsule_options, capsule_values, number
 from capsule_id.commands.compilation import add_cache_argument, prepare_jax
@@ -14,8 +16,6 @@ from capsule_id.output import replace_file
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from capsule_id.physics.model import Trajectory
 
 WIDTHS = {"velocity": "m/s", "penetration": "m", "rounding": "fraction of the break-away force", "tolerance": "1"}
@@ -65,8 +65,6 @@ def run(args: argparse.Namespace) -> int:
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
     prepare_jax(not args.no_cache)
-    import numpy as np
-
     from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.physics.model import Status, status_message
     from capsule_id.physics.simulation import simulate
@@ -119,10 +117,8 @@ def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]
     return end, int(samples)
 
 
-def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
+def _draw(path: Path, t: "Trajectory", section: np.ndarray, G: float) -> None:
     """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
-    import numpy as np
-
     from capsule_id.records.view import MotionView
     from capsule_id.report.figures.fits import overview
     from capsule_id.report.figures.style import new_figure, own_style, png

@@ -24,7 +24,7 @@ MISSING = "–"
 
 # Outside these magnitudes a number in bare SI units is hard to read, and the unit takes a decimal prefix instead.
 _PREFIX_ABOVE, _PREFIX_BELOW = 1e7, 1e-2
-_PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n", -12: "p"}
+_PREFIXES = dict(zip(range(-12, 10, 3), ("p", "n", "µ", "m", "", "k", "M", "G"), strict=True))
 # "1" has no prefix, "kg" has one already, and "m^2" with a prefix would mean the square of the prefixed unit.
 _PREFIXABLE = re.compile(r"(N|m|s|A|rad|Hz|J|W|V)(?![A-Za-z^0-9²³])")
 

@@ -4,6 +4,7 @@ import base64
 import math
 import numbers
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, count
@@ -467,9 +468,8 @@ _ESCAPES = str.maketrans({"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r
 def methods_paragraph(result: Result) -> str:
     """The method in sentences, with the numbers of this fit."""
     version = result.provenance.versions.get("capsule-id", "")
-    kinds: dict[str, int] = {}
-    for table in select_tables(result.rig, result.provenance.experiments):
-        kinds[table.kind.replace("_", " ")] = kinds.get(table.kind.replace("_", " "), 0) + 1
+    tables = select_tables(result.rig, result.provenance.experiments)
+    kinds = Counter(table.kind.replace("_", " ") for table in tables)
     tests = ", ".join(f"{number} x {kind}" for kind, number in kinds.items()) or "the experiments listed in this report"
     data = "Synthetic data were used. " if result.rig.synthetic else ""
     sentences = [

@@ -157,45 +157,6 @@ def _chains(facts: Facts) -> str:
     )
 
 
-POSTERIOR_MESSAGES: Mapping[str, Message] = {
-    "starts.agree": Message(
-        "starts agree",
-        ok="all {starts} starts of the point fit ended at the same maximum",
-        warn=_maxima_without_mass,
-        fail=_maxima_with_mass,
-    ),
-    "chains.converged": Message(
-        "chains converged",
-        ok=_CHAINS,
-        warn=_chains,
-    ),
-    "readings.decisive": Message(
-        "readings left out",
-        ok=lambda facts: filled_in(_DECISIVE if facts["far"] else _NOT_DECISIVE, facts),
-    ),
-    "sample.unfinished": Message(
-        "sample", warn="the sample is still to be drawn: this is the point fit alone, without intervals and figures"
-    ),
-    "sample.maximum": Message(
-        "maximum and sample", ok="the sample of every physical parameter has one mode, at the maximum", fail=_modes
-    ),
-    "sample.modes": Message("maximum and sample", fail=_modes),
-    "parameters.informed": Message(
-        "parameters informed",
-        ok="the data narrow the prior of every physical parameter",
-        warn="the data hardly narrow the prior of {names}: the printed interval is that of the prior. Add a test.",
-    ),
-    "priors.conflict": Message(
-        "priors and data", ok="priors and weighings, {number} in all, agree with the rest of the data", fail=_conflict
-    ),
-    "priors.tails": Message(
-        "boundary effects",
-        ok="no parameter ends in the tail of its prior",
-        warn=_tails,
-    ),
-}
-
-
 # readings: Texts of findings on the readings of a rig, by code.
 
 
@@ -409,10 +370,9 @@ def _coloured_residuals(facts: Facts) -> str:
         f"({stated_p(facts['p'])}). The model lacks an effect or the noise is coloured, and the intervals are not to be "
         "trusted."
     )
-    remedy = {"capsule": _capsule_remedy(facts), "decay": _decay_remedy(facts)}.get(
-        facts.get("model", ""), "Look at the residuals."
-    )
-    return " ".join(filter(None, [seen, _drift(facts), remedy]))
+    remedies = {"capsule": _capsule_remedy, "decay": _decay_remedy}
+    remedy = remedies.get(facts.get("model", ""), lambda facts: "Look at the residuals.")
+    return " ".join(filter(None, [seen, _drift(facts), remedy(facts)]))
 
 
 def _capsule_remedy(facts: Facts) -> str:
@@ -431,8 +391,6 @@ def _capsule_remedy(facts: Facts) -> str:
 
 def _decay_remedy(facts: Facts) -> str:
     """What the fitted model of a free decay contains, and what is left to do."""
-    if facts.get("model") != "decay":
-        return ""
     present = f"Present in the fitted model: {', '.join(facts['present'])}. " if facts["present"] else ""
     if facts.get("tone"):
         return present + filled_in(TONE, facts)
@@ -546,7 +504,41 @@ def _inconsistent(facts: Facts) -> str:
 
 
 FIT_MESSAGES: Mapping[str, Message] = {
-    **POSTERIOR_MESSAGES,
+    "starts.agree": Message(
+        "starts agree",
+        ok="all {starts} starts of the point fit ended at the same maximum",
+        warn=_maxima_without_mass,
+        fail=_maxima_with_mass,
+    ),
+    "chains.converged": Message(
+        "chains converged",
+        ok=_CHAINS,
+        warn=_chains,
+    ),
+    "readings.decisive": Message(
+        "readings left out",
+        ok=lambda facts: filled_in(_DECISIVE if facts["far"] else _NOT_DECISIVE, facts),
+    ),
+    "sample.unfinished": Message(
+        "sample", warn="the sample is still to be drawn: this is the point fit alone, without intervals and figures"
+    ),
+    "sample.maximum": Message(
+        "maximum and sample", ok="the sample of every physical parameter has one mode, at the maximum", fail=_modes
+    ),
+    "sample.modes": Message("maximum and sample", fail=_modes),
+    "parameters.informed": Message(
+        "parameters informed",
+        ok="the data narrow the prior of every physical parameter",
+        warn="the data hardly narrow the prior of {names}: the printed interval is that of the prior. Add a test.",
+    ),
+    "priors.conflict": Message(
+        "priors and data", ok="priors and weighings, {number} in all, agree with the rest of the data", fail=_conflict
+    ),
+    "priors.tails": Message(
+        "boundary effects",
+        ok="no parameter ends in the tail of its prior",
+        warn=_tails,
+    ),
     "residuals.white": Message(
         "residuals white",
         ok="residuals of {records:# record} are white (Ljung–Box, {lags} lags)",

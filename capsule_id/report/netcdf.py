@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from capsule_id.console import refusing_damage
 from capsule_id.errors import InputError
 from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.output import replace_file
@@ -229,13 +230,13 @@ def read_draws(path: Path, count: int, seed: int) -> dict[str, np.ndarray]:
     InputError
         No file of fit-params, or fewer draws than wanted.
     """
-    try:
-        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as data:
-            size = data.sizes["chain"] * data.sizes["draw"]
-            columns = _members_of(data)
-    except Exception as error:  # a damaged file raises any
-        rule, remedy = "--posterior takes the posterior.nc of a result", "give results/<rig>/posterior.nc"
-        raise InputError(rule, type(error).__name__, remedy, path) from None
+    rule, remedy = "--posterior takes the posterior.nc of a result", "give results/<rig>/posterior.nc"
+    with (
+        refusing_damage(rule, remedy, path, lambda error: type(error).__name__),
+        xr.open_dataset(path, group="posterior", engine="h5netcdf") as data,
+    ):
+        size = data.sizes["chain"] * data.sizes["draw"]
+        columns = _members_of(data)
     if not 1 <= count <= size:
         rule = "--draws must lie between 1 and the draws of the file"
         raise InputError(rule, str(count), f"give at most {size}", path)

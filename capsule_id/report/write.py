@@ -9,8 +9,8 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from capsule_id.console import one_line
-from capsule_id.errors import InputError, writing
+from capsule_id.console import one_line, refusing_damage
+from capsule_id.errors import writing
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Result
 from capsule_id.output import as_utf8, write_file
@@ -194,16 +194,15 @@ def _check(stated: str, found: str) -> None:
         raise ValueError("it has changed since it was written")
 
 
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def _reading(path: Path) -> AbstractContextManager[None]:
     """Any error is one of ``path``, a file of a result: it is absent, damaged, or another version wrote it."""
-    try:
-        yield
-    except Exception as error:
+
+    def shown(error: Exception) -> str:
         absent = isinstance(error, FileNotFoundError | NotADirectoryError)
-        rule = "a result must be a directory that this version of fit-params wrote"
-        value = f"it has no {path.name}" if absent else one_line(error)
-        raise InputError(rule, value, "run fit-params again", path) from error
+        return f"it has no {path.name}" if absent else one_line(error)
+
+    rule = "a result must be a directory that this version of fit-params wrote"
+    return refusing_damage(rule, "run fit-params again", path, shown)
 
 
 def _encode(value: object, arrays: dict[str, np.ndarray]) -> Any:

@@ -199,7 +199,7 @@ class FoundLayout:
 
     Attributes
     ----------
-    path, export : the file as read with ``layout``
+    export : the file as read with ``layout``
     layout : what ``rig.toml`` must state, with all possible markers
     names, units : of every column, "" where the file has none
     columns : index of a column of readings -> (rows,) numbers, NaN where missing
@@ -209,7 +209,6 @@ class FoundLayout:
         them, of which ``export`` holds the longest; else ()
     """
 
-    path: Path
     export: Export
     layout: Layout
     names: tuple[str, ...]
@@ -264,7 +263,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
         raise next(iter(unread.values()), InputError(*nothing, path))
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
-    return FoundLayout(path, export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
+    return FoundLayout(export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
 
 
 def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
@@ -304,19 +303,19 @@ def _cells_of_row(line: str, layout: Layout) -> Cells:
 
 def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
     """The layout with the markers alone that occur in the ``used`` columns."""
-    read = EXPORTS[suffix_of(found.path)]
+    read = EXPORTS[suffix_of(found.export.path)]
 
     def reads(markers: tuple[str, ...]) -> bool:
         try:
-            export = read(content, found.path, replace(found.layout, missing=markers))
+            export = read(content, found.export.path, replace(found.layout, missing=markers))
             for column in used:
                 export.values(column)
         except InputError:
             return False
         return True
 
-    suffix = suffix_of(found.path).removesuffix(COMPRESSED)
-    text = TextFile(content, found.path) if suffix in TEXTS else None
+    suffix = suffix_of(found.export.path).removesuffix(COMPRESSED)
+    text = TextFile(content, found.export.path) if suffix in TEXTS else None
     known = ("NaN",) if text is None and suffix != ".xlsx" else MARKERS
     missing = tuple(marker for marker in known if text is None or text.has_cell(marker))
     gaps = any(np.isnan(found.columns[column]).any() for column in used)
@@ -390,9 +389,8 @@ def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float], 
         if values.size and np.mean(np.isnan(values)) <= MOST_MISSING:
             columns[column] = values
     sizes = [values.size for values in columns.values()]
-    common = max(set(sizes), key=lambda size: (sizes.count(size), size)) if sizes else 0
-    longest = max(sizes, default=0)
-    common = longest if common == 1 else common
+    common = max(sizes, key=lambda size: (sizes.count(size), size), default=0)
+    common = max(sizes) if common == 1 else common
     return {column: values for column, values in columns.items() if values.size == common}, singles, unread
 
 

@@ -168,7 +168,7 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
         If the guard leaves too few samples, or the readings do not follow the levels.
     """
     channels = [index for index, name in enumerate(raw.names) if name != "time"]
-    trace = raw.values[:, channels]
+    trace = np.column_stack([raw.columns[index] for index in channels])
     count = len(plateaus.levels)
     if len(time) < FEWEST_SAMPLES * count:
         raise node.error(f"{count} plateaus need more samples", f"{len(time)}", "record them for longer")

@@ -2,16 +2,15 @@
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
-from functools import cache
+from functools import cached_property
 from math import cos
-from types import MappingProxyType, UnionType
+from types import MappingProxyType
 from typing import (
     Annotated,
     Any,
     Generic,
     Literal,
     Protocol,
-    Union,
     get_args,
     get_origin,
     get_type_hints,
@@ -259,10 +258,17 @@ class KindRule:
     parameters: tuple[Parameter, ...] = ()
     bench: bool = True
 
-    @property
+    @cached_property
     def setting_rules(self) -> Mapping[str, SettingRule]:
-        """The rule of every setting, by key."""
-        return _setting_rules(self.settings)
+        """The rule of every setting, by key.
+
+        Raises
+        ------
+        TypeError
+            If the type of a field states no rule.
+        """
+        hints = get_type_hints(self.settings, include_extras=True)
+        return MappingProxyType({f.name: _rule_of(f.name, hints[f.name]) for f in fields(self.settings)})
 
     @property
     def required(self) -> tuple[str, ...]:
@@ -271,29 +277,13 @@ class KindRule:
         return tuple(f.name for f in stated if f.default is MISSING and f.default_factory is MISSING)
 
 
-@cache
-def _setting_rules(settings: type[Settings]) -> Mapping[str, SettingRule]:
-    """The rule of every field of a settings dataclass.
-
-    Raises
-    ------
-    TypeError
-        If the type of a field states no rule.
-    """
-    hints = get_type_hints(settings, include_extras=True)
-    return MappingProxyType({f.name: _rule_of(f.name, hints[f.name]) for f in fields(settings)})
-
-
 def _rule_of(name: str, hint: object) -> SettingRule:
     """The rule in the type of a field."""
-    if get_origin(hint) is Annotated:
-        for extra in get_args(hint)[1:]:
-            if isinstance(extra, SettingRule):
-                return extra
-    one_of = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    for option in one_of:
-        if get_origin(option) is Literal:
-            return ChoiceRule(get_args(option))
+    for part in (hint, *reversed(get_args(hint))):  # a rule stands behind the type
+        if isinstance(part, SettingRule):
+            return part
+        if get_origin(part) is Literal:
+            return ChoiceRule(get_args(part))
     raise TypeError(f"the type of setting {name} must be a Literal, or Annotated with its rule")
 
 

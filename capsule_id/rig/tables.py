@@ -40,7 +40,7 @@ def remedy_of_order(raw: RawTable, index: int) -> str:
     rising = [
         other for other, c in zip(raw.names, raw.columns, strict=True) if other != name and np.all(np.diff(c) > 0.0)
     ]
-    copies = np.setdiff1d(np.arange(len(time)), np.unique(raw.values, axis=0, return_index=True)[1])
+    copies = np.setdiff1d(np.arange(len(time)), np.unique(np.column_stack(raw.columns), axis=0, return_index=True)[1])
     order = np.argsort(time, kind="stable")
     rough = [sum(float(np.sum(np.abs(np.diff(c[rows])))) for c in raw.columns) for rows in (order, slice(None))]
     # A clock that stood still makes up for the lost time in one step.
@@ -115,24 +115,24 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
         At a key of ``rig.toml`` or at a place in a file.
     """
     files: dict[str, Path] = {}
-    hashes: dict[str, str] = {}
+    contents: dict[str, bytes] = {}
     nodes = _file_nodes(entry)
     for node in nodes:
         file, name = table_path(node), node.value
         if file in files.values():
             raise node.error("files must be named once", shown(name), "remove the second one")
         try:
-            with file.open("rb") as opened:
-                files[name], hashes[name] = file, hashlib.file_digest(opened, "sha256").hexdigest()
+            files[name], contents[name] = file, file.read_bytes()
         except OSError as error:
             raise node.error(
                 "file must be readable", f"{shown(name)} ({error.strerror})", "check its permissions"
             ) from None
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     first = files[nodes[0].value]
     plateaus = read_plateaus(entry, kind)
     column_map = read_map(entry, kind, partial(_proposal, first, kind))
     if column_map is None:
-        raw = _read_plain(nodes[0], first, kind)
+        raw = _read_plain(nodes[0], first, contents.pop(nodes[0].value), kind)
         encodings = {nodes[0].value: raw.encoding}
     else:
         # Plateaus replace the time by the column of their levels.
@@ -140,7 +140,9 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
         if plateaus is not None:
             names = (*(name for name in names if name != "time"), plateaus.name)
         _check_names(names, kind, lambda name, *text: entry["columns"].error(*text))
-        exports = {name: EXPORTS[suffix_of(file)](file, file, column_map.layout) for name, file in files.items()}
+        exports = {
+            name: EXPORTS[suffix_of(file)](contents.pop(name), file, column_map.layout) for name, file in files.items()
+        }
         raw = apply_map(entry, list(exports.values()), column_map)
         encodings = {name: export.encoding for name, export in exports.items()}
         del exports
@@ -170,7 +172,7 @@ def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]
         raise InputError("the settings must be a table", "no such table", f"name a file of {' '.join(READERS)}", path)
     columns = {name: rule for name, rule in kind.columns.items() if name != without}
     sets = tuple(tuple(name for name in names if name != without) for names in kind.sets)
-    raw = READERS[path.suffix.lower()](path, path)
+    raw = READERS[path.suffix.lower()](path.read_bytes(), path)
     _check_names(raw.names, replace(kind, columns=columns, sets=sets), partial(raw.error, None))
     return {name: _to_si(raw, index, columns[name]) for index, name in enumerate(raw.names)}
 
@@ -192,16 +194,16 @@ def _file_nodes(entry: Node) -> list[Node]:
     return found
 
 
-def _read_plain(node: Node, file: Path, kind: KindRule) -> RawTable:
+def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTable:
     """A file with the column names of the kind; an error about its header proposes a column map."""
     suffix = suffix_of(file)
     if suffix not in READERS:
         raise node.error(f"a {suffix} file needs a column map", "no columns", f"add {_proposal(file, kind, Layout())}")
     try:
-        raw = READERS[suffix](file, file)
+        raw = READERS[suffix](content, file)
         _check_names(raw.names, kind, partial(raw.error, None))
     except InputError as error:
-        own = _own_map(file, kind)
+        own = _own_map(TextFile(content, file).line(0), kind)
         if isinstance(error, MissingCellsError) and own:
             missing = json.dumps(error.texts, ensure_ascii=False)
             remedy = (
@@ -217,9 +219,9 @@ def _read_plain(node: Node, file: Path, kind: KindRule) -> RawTable:
     return raw
 
 
-def _own_map(file: Path, kind: KindRule) -> str:
-    """The column map of the headers that the kind itself has; "" where they are not those that it needs."""
-    own = [(found[1], found[0], found[2]) for found in HEADER_CELL.finditer(TextFile(file, file).line(0))]
+def _own_map(header: str, kind: KindRule) -> str:
+    """The column map of the headers of a table that the kind itself has; "" where they are not those that it needs."""
+    own = [(found[1], found[0], found[2]) for found in HEADER_CELL.finditer(header)]
     own = [(name, *rest) for name, *rest in own if name in kind.columns]
     names = [name for name, *_ in own]
     try:

@@ -96,13 +96,9 @@ class TomlDocument:
 
     def place(self, path: KeyPath, of_key: bool = False) -> tuple[int, int]:
         """Line and column (1-based characters) of the value (or key) at ``path``; of its nearest ancestor if absent."""
-        first, second = (self.keys, self.values) if of_key else (self.values, self.keys)
-        while path:
-            offset = first.get(path, second.get(path))
-            if offset is not None:
-                return _line_and_column(self.text, offset)
-            path = path[:-1]
-        return 1, 1
+        known = self.values | self.keys if of_key else self.keys | self.values
+        ancestors = (path[:length] for length in range(len(path), 0, -1))
+        return _line_and_column(self.text, next((known[one] for one in ancestors if one in known), 0))
 
 
 def parse_toml(text: str, path: Path) -> TomlDocument:
@@ -178,10 +174,9 @@ class _Scanner:
         self.skip(_BLANK)
         while (start := self.position) < len(self.text):
             if brackets := self.skip(_HEADER):
-                base, (*above, name) = (), [name for name, _ in self.dotted_key()]
-                for part in above:
-                    base = last.get((*base, part), (*base, part))
-                path = base = (*base, name)
+                path = KeyPath()
+                for name, _ in self.dotted_key():
+                    path = (*last.get(path, path), name)
                 if brackets.startswith("[["):
                     self.keys.setdefault(path, start)
                     last[path] = (*path, int(last[path][-1]) + 1 if path in last else 0)
@@ -262,13 +257,14 @@ def closest(word: str, known: Collection[str]) -> str | None:
     folded = {tuple(re.split(r"[_\W]+", one.lower())): one for one in reversed([*known])}
     folded |= {tuple(alias.split("_")): one for alias, one in _ALIASES.items() if one in known and alias not in known}
     joined = {"".join(each): one for each, one in folded.items()}
-    same = [each for each in folded if len(each) == len(parts) and all(map(_similar, parts, each))]
+    same = [
+        each
+        for each in folded
+        if len(each) == len(parts)
+        and all(get_close_matches(one, [other], cutoff=0.65) for one, other in zip(parts, each, strict=True))
+    ]
     near = get_close_matches("_".join(parts), ["_".join(each) for each in same], n=1)
     return joined.get("".join(parts)) or (folded[tuple(near[0].split("_"))] if near else None)
-
-
-def _similar(part: str, other: str) -> bool:
-    return part == other or bool(get_close_matches(part, [other], cutoff=0.65))
 
 
 def is_number(value: object) -> bool:

@@ -31,7 +31,7 @@ begin = time.process_time()
 {}
 print(time.process_time() - begin)
 """
-OURS = 'EXPORTS[".csv"](path, path, Layout(columns=("Time (s)", "x_rel (mm)")))'
+OURS = 'EXPORTS[".csv"](path.read_bytes(), path, Layout(columns=("Time (s)", "x_rel (mm)")))'
 
 
 def write(folder: Path) -> Path:

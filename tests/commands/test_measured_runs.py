@@ -9,7 +9,7 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.cli import capsule_id
 from capsule_id.commands import bifurcate
-from capsule_id.commands.measured_runs import Span, overlay
+from capsule_id.commands.measured_runs import overlay
 from capsule_id.report.figures.sweeps import MeasuredPoint
 from capsule_id.synthetic import synthesize
 
@@ -17,7 +17,7 @@ from capsule_id.synthetic import synthesize
 FIG_10 = {"k2": 59410.0, "G": 1.5e-3, "P_d": 2.5, "Omega": 34.56}
 FIG_6 = {"k2": 18960.0, "G": 1e-3, "P_d": 4.0, "Omega": 34.56}
 FITTED = {"K": 2.0, "k2[medium]": 18960.0, "k2[stiff]": 56410.0}
-F = Span("f", 3.0, 9.0)
+F = ("f", (3.0, 9.0))
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def _truth(folder: Path, run: str) -> dict:
 
 @pytest.mark.full
 def test_fig_10_shows_its_two_runs(folder: Path) -> None:
-    found, said = overlay(read_rig(folder), F, FIG_10, FITTED)
+    found, said = overlay(read_rig(folder), *F, FIG_10, FITTED)
     assert [run.label for run in found] == ["P-1-F-3", "P-1-F-2"]
     expected = [_truth(folder, name)["Omega"] / (2.0 * np.pi) for name in ("run_3", "run_4")]
     np.testing.assert_allclose([run.value for run in found], expected, rtol=1e-12)
@@ -41,7 +41,7 @@ def test_fig_10_shows_its_two_runs(folder: Path) -> None:
     np.testing.assert_allclose([run.mean_velocity for run in found], [8.345e-6, 2.71341e-4], atol=5e-7)
     assert "2 of 4 measured runs overlaid; omitted: run_1 (k2 = 1.896e+04, not 5.941e+04 N/m); run_2" in said
     # The same in rad/s.
-    turned, _ = overlay(read_rig(folder), Span("Omega", 20.0, 60.0), FIG_10, FITTED)
+    turned, _ = overlay(read_rig(folder), "Omega", (20.0, 60.0), FIG_10, FITTED)
     np.testing.assert_allclose([run.value for run in turned], [26.58, 46.0], rtol=1e-12)
 
 
@@ -55,7 +55,7 @@ def test_fig_10_shows_its_two_runs(folder: Path) -> None:
     ],
 )
 def test_another_setting_leaves_a_run_out(folder: Path, change: dict[str, float], reason: str) -> None:
-    found, said = overlay(read_rig(folder), F, FIG_10 | change, FITTED)
+    found, said = overlay(read_rig(folder), *F, FIG_10 | change, FITTED)
     assert found == []
     assert reason in said
 
@@ -64,25 +64,25 @@ def test_another_setting_leaves_a_run_out(folder: Path, change: dict[str, float]
 def test_the_value_of_a_run_is_its_own(folder: Path) -> None:
     """P_d is K times the current; k2 is fitted or the paper's estimate; the gap is stated."""
     rig = read_rig(folder)
-    (load,) = overlay(rig, Span("P_d", 1.0, 8.0), FIG_6, FITTED | {"K": 2.2}, "medium")[0]
+    (load,) = overlay(rig, "P_d", (1.0, 8.0), FIG_6, FITTED | {"K": 2.2}, "medium")[0]
     assert load.value == pytest.approx(2.2 * _truth(folder, "run_1")["current_amplitude"], rel=1e-3)
-    assert overlay(rig, Span("k2", 1e3, 55e3), FIG_6, FITTED)[0][0].value == 18960.0
-    (paper,) = overlay(rig, Span("k2", 1e3, 55e3), FIG_6, {})[0]
+    assert overlay(rig, "k2", (1e3, 55e3), FIG_6, FITTED)[0][0].value == 18960.0
+    (paper,) = overlay(rig, "k2", (1e3, 55e3), FIG_6, {})[0]
     assert paper.value == pytest.approx(18960.0, rel=0.01)
     assert paper.value != 18960.0
-    (gap,) = overlay(rig, Span("G", 0.0, 2e-3), FIG_6, FITTED)[0]
+    (gap,) = overlay(rig, "G", (0.0, 2e-3), FIG_6, FITTED)[0]
     assert gap.value == pytest.approx(1.032e-3)
     # At another frequency, by less than 0.5 % and by more.
-    assert overlay(rig, Span("G", 0.0, 2e-3), FIG_6 | {"Omega": 34.7}, FITTED)[0] == [gap]
-    assert overlay(rig, Span("G", 0.0, 2e-3), FIG_6 | {"Omega": 34.8}, FITTED)[0] == []
+    assert overlay(rig, "G", (0.0, 2e-3), FIG_6 | {"Omega": 34.7}, FITTED)[0] == [gap]
+    assert overlay(rig, "G", (0.0, 2e-3), FIG_6 | {"Omega": 34.8}, FITTED)[0] == []
 
 
 @pytest.mark.full
 def test_the_sentence_gives_reasons_for_omitted_runs(folder: Path) -> None:
     rig = read_rig(folder)
-    assert "f = 4.23 Hz is outside the diagram" in overlay(rig, Span("f", 5.0, 9.0), FIG_10, FITTED)[1]
-    assert "mu is not a setting of a run" in overlay(rig, Span("mu", 0.1, 0.9), FIG_10, FITTED)[1]
-    by_name = overlay(rig, F, FIG_10, FITTED, "stiff")
+    assert "f = 4.23 Hz is outside the diagram" in overlay(rig, "f", (5.0, 9.0), FIG_10, FITTED)[1]
+    assert "mu is not a setting of a run" in overlay(rig, "mu", (0.1, 0.9), FIG_10, FITTED)[1]
+    by_name = overlay(rig, *F, FIG_10, FITTED, "stiff")
     assert "run_3 (spring hard, not stiff)" in by_name[1]
 
 

@@ -40,12 +40,13 @@ def test_round_trip(delimiter: str, decimal: str, ending: str, mark: str, column
     table = read_csv(ending.join([mark + header, *rows, "", "  ", ""]).encode(), Path("t.csv"))
     assert table.names == tuple(f"c{i}" for i in range(columns))
     assert table.units == tuple("mm" if i % 2 else "N/m" for i in range(columns))
-    np.testing.assert_array_equal(table.values, values)
+    np.testing.assert_array_equal(np.column_stack(table.columns), values)
     np.testing.assert_array_equal(table.rows, np.arange(2, 42))
 
 
 def test_cell_by_cell_reading_agrees_with_the_fast_one() -> None:
     values = numbers(500, 2, seed=8)
+    values = values[np.abs(values).min(axis=1) > 1e-300]  # below it the cells are always read one by one
     lines = ["a [m];b [s]", *(f"{a!r}; +{abs(b)!r} " for a, b in values.tolist())]
     shape = Shape(1, ";", 2, ".")
     fast = cast(np.ndarray, plain_block("\n".join([*lines[1:], ""]).encode(), shape, [0, 1]))
@@ -68,7 +69,7 @@ def test_places_are_line_and_first_character_of_the_cell() -> None:
 def test_a_fault_at_the_end_of_a_large_file_is_found() -> None:
     text = "a [m],b [s]\n" + "".join(f"{i},{i / 7}\n" for i in range(100_000))
     table = read_csv(text.encode(), Path("t.csv"))
-    np.testing.assert_array_equal(table.values[:, 1], np.arange(100_000) / 7)
+    np.testing.assert_array_equal(table.columns[1], np.arange(100_000) / 7)
     with pytest.raises(InputError, match=r"^t\.csv:100002:3: a cell must be a number, 'x', write"):
         read_csv((text + "1,x\n").encode(), Path("t.csv"))
 

@@ -55,7 +55,7 @@ def test_deep_keys_are_refused_with_their_place(depth: int) -> None:
 def test_other_white_space_is_no_part_of_a_number(mark: str, cell: str) -> None:
     with pytest.raises(InputError, match=r"^table.csv:2:1: a cell must be a number, "):
         read_csv(f"x [m]\n{cell.format(mark)}\n".encode(), TABLE)
-    assert read_csv(b"x [m]\n 1\t\n", TABLE).values == 1.0  # spaces and tabs stay allowed
+    assert read_csv(b"x [m]\n 1\t\n", TABLE).columns[0] == 1.0  # spaces and tabs stay allowed
 
 
 @pytest.mark.parametrize("folder", [b"data", ["data"], None, 3])

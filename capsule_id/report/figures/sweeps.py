@@ -304,14 +304,7 @@ def quantity(data: xr.Dataset, name: str, ax: Axes) -> None:
 def _mesh(data: xr.Dataset, values: np.ndarray, title: str, ax: Axes, **look: Any) -> Any:
     """``values`` (first quantity, second) as cells at their places in the units to be drawn."""
     first, second = map(str, data["label"].dims)
-    mesh = ax.pcolormesh(_edges(data[first]), _edges(data[second]), values.T, rasterized=True, **look)
+    x, y = data[first].to_numpy(), data[second].to_numpy()
+    mesh = ax.pcolormesh(x, y, values.T, shading="nearest", rasterized=True, **look)
     set_text(ax, _axis_label(data, first), _axis_label(data, second), title)
     return mesh
-
-
-def _edges(quantity: xr.DataArray) -> np.ndarray:
-    x = quantity.to_numpy()
-    if len(x) == 1:
-        return np.array([x[0] - 0.5, x[0] + 0.5])
-    middle = 0.5 * (x[1:] + x[:-1])
-    return np.concatenate([[1.5 * x[0] - 0.5 * x[1]], middle, [1.5 * x[-1] - 0.5 * x[-2]]])

@@ -1,4 +1,4 @@
-"""Readers of table files, by suffix, each from the bytes of a file, or from where they lie.
+"""Readers of table files, by suffix, each from the bytes of a file.
 
 ``READERS`` take tables with a header ``name [unit]`` per column. ``EXPORTS`` take files of any layout, whose columns
 ``rig.toml`` maps. Text tables may be compressed: ``.csv.gz``.
@@ -9,17 +9,17 @@ from pathlib import Path
 
 from capsule_id.rig.formats.binary import read_hdf5, read_mat, read_npz, read_parquet, read_tdms, read_xlsx
 from capsule_id.rig.formats.layouts import read_lvm, read_text
-from capsule_id.rig.formats.raw import COMPRESSED, Content, Export, Layout, RawTable
+from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, RawTable
 from capsule_id.rig.formats.text import read_csv
 
-TEXTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
+TEXTS: Mapping[str, Callable[[bytes, Path, Layout], Export]] = {
     ".csv": read_text,
     ".txt": read_text,
     ".tsv": read_text,
     ".dat": read_text,
     ".lvm": read_lvm,
 }
-_TABLES: Mapping[str, Callable[[Content, Path], RawTable]] = {".csv": read_csv, ".txt": read_csv, ".tsv": read_csv}
+_TABLES: Mapping[str, Callable[[bytes, Path], RawTable]] = {".csv": read_csv, ".txt": read_csv, ".tsv": read_csv}
 
 
 def suffix_of(path: Path) -> str:
@@ -28,11 +28,11 @@ def suffix_of(path: Path) -> str:
     return Path(path.stem).suffix.lower() + last if last == COMPRESSED else last
 
 
-READERS: Mapping[str, Callable[[Content, Path], RawTable]] = {
+READERS: Mapping[str, Callable[[bytes, Path], RawTable]] = {
     **_TABLES,
     **{suffix + COMPRESSED: read for suffix, read in _TABLES.items()},
 }
-EXPORTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
+EXPORTS: Mapping[str, Callable[[bytes, Path, Layout], Export]] = {
     **TEXTS,
     **{suffix + COMPRESSED: read for suffix, read in TEXTS.items()},
     ".mat": read_mat,

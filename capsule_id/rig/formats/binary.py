@@ -26,7 +26,6 @@ from capsule_id.rig.formats.raw import (
     LARGEST_CONTENT,
     READING,
     SPREAD,
-    Content,
     Export,
     Layout,
     complete,
@@ -34,7 +33,6 @@ from capsule_id.rig.formats.raw import (
     largest,
     refuse_large,
     require,
-    whole,
 )
 from capsule_id.views import counted
 
@@ -59,7 +57,7 @@ class ArraysReader:
     remedy: str
     package: str = ""
 
-    def __call__(self, content: Content, path: Path, layout: Layout) -> Export:
+    def __call__(self, content: bytes, path: Path, layout: Layout) -> Export:
         """The columns of a file.
 
         Raises
@@ -71,7 +69,6 @@ class ArraysReader:
             require(self.package, path)
         arrays, units, readings = dict[str, np.ndarray](), dict[str, str](), 0
         with complete(path, self.remedy):
-            content = whole(content)
             for name, array, units[name] in self.find(content, path):
                 if array is not None:
                     arrays[name], readings = array, readings + array.size
@@ -113,8 +110,7 @@ def _data_sets(content: bytes, path: Path) -> Named:
     while (line := out.readline()).endswith(b"\n"):
         name, dtype, shape, unit, fault = json.loads(line)
         if fault is not None:
-            rule, value, remedy = fault
-            raise InputError(rule, value, remedy, path)
+            raise InputError(*fault, file=path)
         if name is None:
             return
         values = out.read(size := np.dtype(dtype).itemsize * prod(shape))
@@ -244,14 +240,14 @@ _COMPLEX = 0x0800  # flag of an array
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 
 
-def read_mat(content: Content, path: Path, layout: Layout) -> Export:
+def read_mat(content: bytes, path: Path, layout: Layout) -> Export:
     """Read the vectors of a MATLAB file by name; column 2 of a matrix ``data`` is called ``data(:,2)``.
 
     Fields of structs have names such as ``run.time``, or ``run(2).time`` in an array of structs.
 
     Parameters
     ----------
-    content : the bytes of the file, or where they lie
+    content : the bytes of the file
     path : its name, for error lines
     layout : ``missing`` may hold "NaN"; the rest does not apply
 
@@ -260,7 +256,6 @@ def read_mat(content: Content, path: Path, layout: Layout) -> Export:
     InputError
         If it is no MATLAB file, is damaged, or has no numeric variable.
     """
-    content = whole(content)
     hdf5 = content.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF"))
     return (read_hdf5 if hdf5 else _read_mat_5)(content, path, layout)
 
@@ -465,14 +460,14 @@ MOST_CELLS = 2_000_000
 BLANK_ROW = 20
 
 
-def read_xlsx(content: Content, path: Path, layout: Layout) -> Export:
+def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
     """Read a sheet with titles, headers and rows of units in the same way as a text export.
 
     Places are the row and the column of the sheet. A formula counts by the value that the workbook holds for it.
 
     Parameters
     ----------
-    content : the bytes of the file, or where they lie
+    content : the bytes of the file
     path : its name, for error lines
     layout : as for text; ``data_from_line`` and ``data_to_line`` are rows of the sheet
 
@@ -482,7 +477,7 @@ def read_xlsx(content: Content, path: Path, layout: Layout) -> Export:
         If openpyxl is not installed, the file is damaged or too large, or the rows of numbers are not found.
     """
     require("openpyxl", path)
-    lines = _lines_of_book(whole(content), path)
+    lines = _lines_of_book(content, path)
     try:
         export = read_text("\n".join(lines).encode(), path, layout)
     except InputError as error:

@@ -14,12 +14,10 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import (
     MOST_TITLES,
-    Content,
     Export,
     Layout,
     Place,
     TextFile,
-    occurrences,
     refuse_line,
     refuse_wide,
 )
@@ -52,12 +50,12 @@ _MANY_ROWS = 50  # whose whole parts do not increase by chance
 _COMMA_BETWEEN_DIGITS = re.compile(r"\s*([+-]?[0-9]+),[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 
 
-def read_text(content: Content, path: Path, layout: Layout) -> Export:
+def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     """Read a text export.
 
     Parameters
     ----------
-    content : the bytes of the file, or where they lie
+    content : the bytes of the file
     path : its name, for error lines
     layout : what ``rig.toml`` states about it
 
@@ -87,7 +85,7 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     width = len(cells) + (not trailing)
     refuse_wide(width, path, first + 1)
     above = range((layout.data_from_line or first + 1) - 2, -1, -1)
-    found = [(i, names) for i in above if (names := _headers(head[i], delimiter, width, layout))]
+    found = [(i, names) for i in above if (names := _headers(head[i], delimiter, width))]
     headers = tuple(names for _, names in found)
     wanted = [k for k in range(width) if layout.columns is None or is_wanted(k, headers, layout.columns)]
     decimal = "." if delimiter == "," else layout.decimal
@@ -105,13 +103,10 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     return Export(path, headers, width, lines, rows.column, place, file.encoding, rows.words)
 
 
-def _file(content: Content, path: Path, layout: Layout) -> TextFile:
+def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
     """The text down to ``data_to_line``, where that is stated."""
-    whole, last = TextFile(content, path), layout.data_to_line
-    if last is None:
-        return whole
-    number = sum(occurrences("\n", text) for _, text in whole.blocks())
-    if last > number:
+    file, last = TextFile(content, path, layout.data_to_line), layout.data_to_line or 0
+    if last and last > (number := sum(text.count(b"\n") for _, text in file.blocks())):
         raise InputError(
             f"data_to_line must be a line of the file, which has {number}",
             str(last),
@@ -120,7 +115,7 @@ def _file(content: Content, path: Path, layout: Layout) -> TextFile:
             max(number, 1),
             1,
         )
-    return TextFile(content, path, last)
+    return file
 
 
 def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:
@@ -193,13 +188,13 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
 def _mapped(cells: list[str], lines: list[str], layout: Layout) -> list[str]:
     """The cells of the first row with a number, the last of ``lines``, that are read as numbers; all without a map."""
     *above, row = lines
-    found = (_headers(line, delimiter_of(row, layout), len(cells), layout) for line in above)
+    found = (_headers(line, delimiter_of(row, layout), len(cells)) for line in above)
     headers = tuple(names for names in found if names)
     wanted = [k for k in range(len(cells)) if is_wanted(k, headers, layout.columns or ())]
     return [cells[k] for k in wanted if not is_wanted(k, headers, layout.words)] or cells
 
 
-def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tuple[str, ...]:
+def _headers(line: str, delimiter: str | None, width: int) -> tuple[str, ...]:
     """The headers in a line above the numbers; () if it holds none."""
     bare = line.lstrip(" " if delimiter == "\t" else BLANKS).lstrip("".join(COMMENTS))  # a first cell may be empty
     for cells in _header_cells(bare, delimiter):
@@ -303,7 +298,7 @@ class _Segment:
     stop: int
 
 
-def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
+def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
     """Read the columns of a LabVIEW measurement file; segments follow one another.
 
     ``X_Value`` is the column of times (or another abscissa). A file without such columns has them computed from X0 and
@@ -311,7 +306,7 @@ def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
 
     Parameters
     ----------
-    content : the bytes of the file, or where they lie
+    content : the bytes of the file
     path : its name, for error lines
     layout : ``missing`` may hold texts of cells
 

@@ -8,18 +8,18 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
+from capsule_id.console import one_line, refusing_damage
 from capsule_id.errors import InputError
 
 # limits: Limits and errors that all readers of files share.
 
 
-#: The bytes of a file, or where they lie.
-Content = bytes | Path
 #: Largest decompressed size of a file, bytes; of a small one the larger of ``SMALL_CONTENT`` and ``SPREAD`` times its own
 #: size. It stops files that grow without limit when they are unpacked.
 LARGEST_CONTENT, SMALL_CONTENT, SPREAD = 1 << 30, 1 << 26, 10
@@ -31,19 +31,18 @@ MOST_SERIES = 200
 LONGEST_LINE, MOST_COLUMNS, MOST_TITLES = 1 << 18, 2_000, 10_000
 
 
-def largest(content: Content) -> int:
+def largest(content: bytes) -> int:
     """Most bytes of text that the bytes of a file justify, or ``READING`` for each reading."""
-    own = len(content) if isinstance(content, bytes) else content.stat().st_size
-    return min(LARGEST_CONTENT, max(SMALL_CONTENT, SPREAD * own))
+    return min(LARGEST_CONTENT, max(SMALL_CONTENT, SPREAD * len(content)))
 
 
-def refuse_large(size: int, content: Content, path: Path) -> None:
+def refuse_large(size: int, content: bytes, path: Path) -> None:
     """Refuse a file that unpacks to more bytes than its own justify.
 
     Parameters
     ----------
     size : of what it holds: bytes of text, or ``READING`` for each reading
-    content : the bytes of the file, or where they lie
+    content : the bytes of the file
 
     Raises
     ------
@@ -92,31 +91,13 @@ def require(package: str, path: Path) -> None:
         ) from None
 
 
-def whole(content: Content) -> bytes:
-    """The bytes of a file."""
-    return content if isinstance(content, bytes) else content.read_bytes()
-
-
 @contextmanager
 def complete(path: Path, remedy: str) -> Iterator[None]:
-    """Turn every exception of a library about a damaged file into an error line; its warnings are not shown.
-
-    Libraries document no list of exceptions for damaged files, and fuzzing finds most of Python's.
-
-    Raises
-    ------
-    InputError
-        Where the body raises an exception; an ``InputError`` passes unchanged.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    except InputError:
-        raise
-    except Exception as error:
-        value = " ".join(f"{type(error).__name__}: {error}".split())
-        raise InputError(f"a {path.suffix} file must be complete", value[:200], remedy, path) from None
+    """``refusing_damage`` of a library that reads a file, whose warnings are not shown."""
+    rule = f"a {path.suffix} file must be complete"
+    with refusing_damage(rule, remedy, path, lambda error: one_line(error)[:200]), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 # blocks: The text of a file in blocks of whole lines.
@@ -145,7 +126,7 @@ class TextFile:
         If the content is no text, at its line and character, or a compressed file is damaged or too large.
     """
 
-    def __init__(self, content: Content, path: Path, last: int | None = None) -> None:
+    def __init__(self, content: bytes, path: Path, last: int | None = None) -> None:
         self.path, self.last = path, last
         raw = _bytes_of(content, path)
         self.encoding = _encoding(raw, path)
@@ -178,7 +159,7 @@ class TextFile:
             begin, end = end, self._text.find(b"\n", end + BLOCK) + 1 or len(self._text)
             block = self._text[begin:end]
             text = block if block.endswith(b"\n") else block + b"\n"
-            lines = occurrences("\n", text)
+            lines = text.count(b"\n")
             if self.last is not None and number + lines > self.last:
                 lines = self.last - number
                 text = b"\n".join([*text.split(b"\n", lines)[:-1], b""]) if lines else b""
@@ -198,19 +179,16 @@ class TextFile:
         return next(self.lines(number), "")
 
 
-def _bytes_of(content: Content, path: Path) -> bytes:
+def _bytes_of(content: bytes, path: Path) -> bytes:
     """The bytes of a text, decompressed."""
     if path.suffix.lower() != COMPRESSED:
-        return whole(content)
-    found, size = list[bytes](), 0
-    with gzip.open(io.BytesIO(content) if isinstance(content, bytes) else content) as file:
-        while True:
-            with complete(path, "compress it again by gzip"):
-                found.append(file.read(BLOCK))
-            size += len(found[-1])
-            refuse_large(size, content, path)
-            if not found[-1]:
-                return b"".join(found)
+        return content
+    found = list[bytes]()
+    with complete(path, "compress it again by gzip"), gzip.open(io.BytesIO(content)) as file:
+        for block in iter(partial(file.read, BLOCK), b""):
+            found.append(block)
+            refuse_large(sum(map(len, found)), content, path)
+    return b"".join(found)
 
 
 def _encoding(raw: bytes, path: Path) -> str:
@@ -226,16 +204,11 @@ def _encoding(raw: bytes, path: Path) -> str:
     if not marked and (nul := raw.find(b"\0")) >= 0:
         raise InputError(rule, *binary, path, *place_of_byte(raw[:nul], "utf-8"))
     codec = "utf-16" if marked else "utf-8"
-    decoder, fault = codecs.getincrementaldecoder(codec)(), None
-    for begin in range(0, len(raw), BLOCK):  # a text as a whole may take four times its bytes
-        try:
-            decoder.decode(raw[begin : begin + BLOCK], begin + BLOCK >= len(raw))
-        except UnicodeDecodeError as error:
-            # The decoder keeps an incomplete character of the block before.
-            fault = min(begin + BLOCK, len(raw)) - len(error.object) + error.start
-            break
-    if fault is None:
+    try:
+        raw.decode(codec)
         return "UTF-16" if marked else "UTF-8"
+    except UnicodeDecodeError as error:
+        fault = error.start
     if marked:
         raise InputError(rule, "damaged UTF-16", "save it as UTF-8", path, *place_of_byte(raw[:fault], codec))
     wrong = fault if not raw[:fault].isascii() else None
@@ -250,11 +223,6 @@ def _encoding(raw: bytes, path: Path) -> str:
             *place_of_byte(raw[:wrong], codec),
         )
     return WINDOWS
-
-
-def occurrences(mark: str, text: bytes) -> int:
-    """How often an ASCII character occurs; faster than ``count`` where it is frequent."""
-    return int(np.count_nonzero(np.frombuffer(text, np.uint8) == ord(mark)))
 
 
 def lines_of(text: bytes) -> list[str]:
@@ -297,11 +265,6 @@ class RawTable:
     missing: int = 0
     other: int = 0
     rejected: int = 0
-
-    @property
-    def values(self) -> np.ndarray:
-        """A copy of the numbers, (rows, columns)."""
-        return np.column_stack(self.columns)
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""

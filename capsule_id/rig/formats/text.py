@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Content, Place, RawTable, TextFile, lines_of, occurrences, refuse_wide
+from capsule_id.rig.formats.raw import Place, RawTable, TextFile, lines_of, refuse_wide
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -24,9 +24,8 @@ from capsule_id.views import counted
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
-# A number may be below the smallest float64 where it has such an exponent.
-_TINY = re.compile(rb"[eE]-0*(?:[1-9][0-9]{3}|[3-9][0-9]{2})")
-_LONGEST_MANTISSA = 400  # characters
+# Only with such an exponent may a number be below the smallest float64: its cells are then read one by one.
+_TINY = re.compile("[eE]-0*(?:[1-9][0-9]{3}|[3-9][0-9]{2})")
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
 _LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
@@ -105,16 +104,6 @@ def is_beyond_floats(value: float, written: str) -> bool:
     return not np.isfinite(value) or (value == 0.0 and re.search("[1-9]", re.split("[eE]", written)[0]) is not None)
 
 
-def _holds_lost_number(text: bytes) -> bool:
-    """Whether a number of ``text``, with decimal points, is not 0, and 0 as a float64."""
-    for found in _TINY.finditer(text):
-        before = text[max(found.start() - _LONGEST_MANTISSA, 0) : found.start()]
-        mantissa = before[len(before.rstrip(b"0123456789.")) :]
-        if mantissa.strip(b"0.") and float(mantissa + found[0]) == 0.0:
-            return True
-    return False
-
-
 def decimal_mark(texts: Sequence[str], missing: Sequence[str]) -> str | None:
     """The first point or comma of the cells of a column, None where they have none."""
     found = re.search("[.,]", "\n".join(text for text in texts if text not in missing))
@@ -147,8 +136,7 @@ def read_column(
     if (_NUMBER_CHARACTERS | {mark}).issuperset("".join([texts[k] for k in used])):  # quickly, where all are numbers
         with suppress(ValueError):
             values[used] = [float(texts[k].replace(mark, ".")) for k in used]
-            lost = not values[used].all() and _holds_lost_number("\n".join(texts).replace(mark, ".").encode())
-            if np.isfinite(values[used]).all() and not lost:
+            if np.isfinite(values[used]).all() and (values[used].all() or not _TINY.search("\n".join(texts))):
                 return values
     for k, text in enumerate(texts):
         if text in missing:
@@ -258,19 +246,19 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     text : lines in UTF-8, each with a line feed
     columns : indices of the columns that are returned
     """
-    delimiter, decimal, count = shape.delimiter, shape.decimal or ".", occurrences("\n", text)
+    delimiter, decimal, count = shape.delimiter, shape.decimal or ".", text.count(b"\n")
     allowed = f"{_PLAIN}{delimiter or ''}{decimal}\n".encode()
     if not text.strip() or text.translate(None, allowed):
         return None
     # Rows with a last cell have all cells, by the number of separators. Cells between spaces are counted by the reader.
-    if delimiter is not None and occurrences(delimiter, text) != count * (shape.width - 1 + shape.trailing):
+    if delimiter is not None and text.count(delimiter.encode()) != count * (shape.width - 1 + shape.trailing):
         return None
     used = list(range(shape.width)) if delimiter is None else sorted({*columns, shape.width - 1})
     text = text.replace(b",", b".") if decimal == "," else text
     values = _parse(text, delimiter, used)
     if values is None or values.shape != (count, len(used)) or not np.isfinite(values).all():
         return None
-    if not values.all() and _holds_lost_number(text):
+    if not values.all() and _TINY.search(text.decode()):
         return None
     return values[:, np.searchsorted(used, columns)]
 
@@ -307,14 +295,14 @@ def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | N
     """The rows of a text without missing, empty or other cells; None for any other text."""
     rows = Rows({column: [] for column in columns}, {})
     for number, text in file.blocks(shape.first):
-        numbers: np.ndarray | list[int] = np.arange(number, number + occurrences("\n", text), dtype=np.int32)
+        numbers: np.ndarray | list[int] = np.arange(number, number + text.count(b"\n"), dtype=np.int32)
         values = plain_block(text, shape, columns)
         if values is None:
             kept = list(_rows_in(number, text))
             if not kept:
                 continue
             numbers, lines = [line for line, _ in kept], [line for _, line in kept]
-            if len(lines) < occurrences("\n", text):  # blank lines or comments
+            if len(lines) < text.count(b"\n"):  # blank lines or comments
                 values = plain_block("\n".join([*lines, ""]).encode(), shape, columns)
         if values is None:
             return None
@@ -411,12 +399,12 @@ class MissingCellsError(InputError):
         self.texts = texts
 
 
-def read_csv(content: Content, path: Path) -> RawTable:
+def read_csv(content: bytes, path: Path) -> RawTable:
     """Read a CSV table.
 
     Parameters
     ----------
-    content : the bytes of the file, or where they lie
+    content : the bytes of the file
     path : its name, for error lines
 
     Raises

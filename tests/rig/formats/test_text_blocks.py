@@ -54,7 +54,18 @@ def outcome(text: str, suffix: str, layout: Layout | None) -> list[str]:
     try:
         if layout is None:
             raw = READERS[suffix](text.encode(), path)
-            return [repr((raw.names, raw.units, raw.values.tolist(), raw.rows.tolist(), raw.place(0, 0), raw.encoding))]
+            return [
+                repr(
+                    (
+                        raw.names,
+                        raw.units,
+                        [c.tolist() for c in raw.columns],
+                        raw.rows.tolist(),
+                        raw.place(0, 0),
+                        raw.encoding,
+                    )
+                )
+            ]
         export = EXPORTS[suffix](text.encode(), path, layout)
     except InputError as error:
         return [str(error)]
@@ -158,7 +169,7 @@ def test_blanks_behind_a_row_count_as_cells_in_the_last_row_too(tmp_path: Path, 
     path = tmp_path / "d.csv"
     path.write_text("\n".join(["deflection [mm]\tforce [N]", *rows, " ", ""]), encoding="utf-8")
     with pytest.raises(InputError, match="a row must have 2 cells") as caught:
-        READERS[".csv"](path, path)
+        READERS[".csv"](path.read_bytes(), path)
     assert caught.value.line == row + 2
 
 
@@ -199,7 +210,7 @@ def test_memory_is_a_small_multiple_of_the_file(tmp_path: Path) -> None:
     path = tmp_path / "d.csv"
     path.write_text("t," + ",".join(f"x{k}" for k in range(10)) + f"\n{line}\n" + f"{line}\n" * (count - 1))
     tracemalloc.start()
-    export = EXPORTS[".csv"](path, path, Layout(columns=("t", "x3")))
+    export = EXPORTS[".csv"](path.read_bytes(), path, Layout(columns=("t", "x3")))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(export.values(0)) == count
