@@ -83,7 +83,7 @@ def _in_chunks(*given: Any) -> Displacement:
 
     def advance(state: _Lane) -> _Lane:
         """One block of every active lane; the lanes of a chunk need about as many steps each."""
-        order = jnp.argsort(jnp.where(state.active, state.effort, jnp.inf))
+        order = jnp.argsort(jnp.where(state.active, state.effort, jnp.inf))  # pyright: ignore[reportArgumentType]
 
         def chunk(i: Any, state: _Lane) -> _Lane:
             index = jax.lax.dynamic_slice_in_dim(order, i * CHUNK, CHUNK)
@@ -110,10 +110,10 @@ def _block(lane: _Lane, p: CapsuleParameters, e: Drive, law: FrictionLaw, period
     repeats = (ahead > 1.0) & (change <= REPEATS**2 * size)
     done = lane.done + ahead
     left = jnp.where(repeats, count - done, 0.0) * (ends[2][1] - ends[2][0])
-    new = (ends[0][1] + left, ends[1][1], ends[2][1] + left, ends[3][1])
+    new = (ends[0][1] + left, ends[1][1], ends[2][1] + left, ends[3][1])  # pyright: ignore[reportOperatorIssue]
     state = tuple(jnp.where(lane.active, x, y) for x, y in zip(new, lane.state, strict=True))
     status = jnp.where(lane.active, jnp.maximum(lane.status, t.status), lane.status)
-    active = lane.active & (status <= Status.GRAZING) & ~repeats & (done < count)
+    active = lane.active & (status <= Status.GRAZING) & ~repeats & (done < count)  # pyright: ignore[reportOperatorIssue]
     return _Lane(done, state, active, status, t.steps / jnp.maximum(ahead, 1.0))
 
 

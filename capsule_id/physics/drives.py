@@ -122,7 +122,7 @@ class Pulses(Drive):
         if self.lag is None:
             return half, self._end(half)
         transient = self.force_at(t, self._middle(half)) - self._level(half)
-        return half, t, jnp.where(self._lagging(), transient, 0.0), self._end(half)
+        return half, t, jnp.where(self._lagging(), transient, 0.0), self._end(half)  # pyright: ignore[reportReturnType]
 
     def following(self, piece: Piece) -> Piece:
         """The next half-period; D is continuous where there is a lag."""
@@ -154,7 +154,7 @@ class Pulses(Drive):
         end = (edge - self._turn()) * self.period
         if self.lag is not None:
             end = end + jnp.where(self._lagging(), 0.0, self.lag)
-        return jnp.where((self.duty > 0.0) & (self.duty < 1.0), end, jnp.inf)
+        return jnp.where((self.duty > 0.0) & (self.duty < 1.0), end, jnp.inf)  # pyright: ignore[reportReturnType]
 
     def series(self, piece: Piece, t: jax.Array, h: Any, order: int) -> Series:
         """Constant, and the transient's exponential."""
@@ -216,7 +216,7 @@ class _Lines(Record, Drive):
     def _at(self, index: jax.Array) -> Piece:
         last = index >= self.times.shape[-1] - 2
         end = jnp.where(last, jnp.finfo(float).max, _sample(self.times, index + 1))
-        return index.astype(float), *self._line(index), end
+        return index.astype(float), *self._line(index), end  # pyright: ignore[reportReturnType]
 
     def series(self, piece: Piece, t: jax.Array, h: Any, order: int) -> Series:
         """A straight line."""

@@ -112,7 +112,7 @@ def half_cycles(
         extra = extra - sine * (c + c_q * stretch * omega * r * sine) / m1
         rate = omega * (stretch * sine**2 + cosine**2 / stretch) + extra * cosine
         rate = jnp.where(rate > 0.0, rate, jnp.nan)
-        return r * sine * ((1.0 / stretch - stretch) * omega * cosine + extra) / rate, 1.0 / rate
+        return r * sine * ((1.0 / stretch - stretch) * omega * cosine + extra) / rate, 1.0 / rate  # pyright: ignore[reportOperatorIssue]
 
     def step(state: tuple[Any, Any, Any], at: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any]]:
         r, t, stretch = state

@@ -159,7 +159,7 @@ def averaged_process(times: ReadingTimes, correlation_time: Any) -> SymmQSM:
     inside = lags < count
     reach = jnp.sum(decay * inside, axis=1) / times.count
     pairs = jnp.where(inside, jnp.where(lags == 0, 1.0, 2.0) * (count - lags), 0.0)
-    variance = jnp.sum(pairs * decay, axis=1) / times.count**2
+    variance = jnp.sum(pairs * decay, axis=1) / times.count**2  # pyright: ignore[reportArgumentType]
     n, reach = times.time.shape[0], jnp.broadcast_to(reach, times.time.shape)
     gap = jnp.concatenate([jnp.ones(1), jnp.exp(-(times.first[1:] - times.last[:-1]) / correlation_time)])
     ends = jnp.concatenate([jnp.ones(1), jnp.exp(-jnp.diff(times.last) / correlation_time)])

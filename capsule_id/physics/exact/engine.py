@@ -287,7 +287,7 @@ def take_step(
     finite = jnp.isfinite(at.r + at.w + at.X2 + at.v)
     status = jnp.where(active & grazing, jnp.maximum(run.status, Status.GRAZING), run.status)
     status = jnp.where(active & ~finished & (steps >= max_steps), jnp.int32(Status.TOO_MANY_STEPS), status)
-    status = jnp.where(active & ~finite, jnp.int32(Status.NOT_FINITE), status)
+    status = jnp.where(active & ~finite, jnp.int32(Status.NOT_FINITE), status)  # pyright: ignore[reportArgumentType, reportCallIssue]
     moved = active & finite
     contacts, back = (
         count + (moved & touching(constants, after, side) & ~touching(constants, mode, side))

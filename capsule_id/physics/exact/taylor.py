@@ -260,7 +260,7 @@ def acting(constants: Constants, r: Any, gaps: Sequence[Any], mode: Mode) -> Ite
 
 def terms(constants: Constants, state: CapsuleState, mode: Mode) -> list[jax.Array]:
     """The parts of f in N in the mode: what the rod puts on the capsule, elastic and damping, force by force."""
-    return [
+    return [  # pyright: ignore[reportReturnType]
         jnp.where(acts, force.side * part, 0.0)
         for force, d, acts in acting(constants, state.r, state.gaps, mode)
         for part in (force.elastic(d), force.damping(d, force.side * state.w))

@@ -180,7 +180,7 @@ def _nearest(p: CapsuleParameters, side: float) -> jax.Array:
         for force in forces_of(p)
         if force.gap is not None and force.side == side
     ]
-    return reduce(jnp.minimum, gaps, jnp.full_like(p.m1, jnp.inf))
+    return reduce(jnp.minimum, gaps, jnp.full_like(p.m1, jnp.inf))  # pyright: ignore[reportArgumentType]
 
 
 def _valid(system: System) -> jax.Array:
@@ -196,7 +196,7 @@ def _problem(system: System, semantics: Semantics) -> Problem:
     lightness = 1.0 / p.m1 + 1.0 / p.m2
     # Rates of springs, damper, drive and friction, 1/s; the switch's own rate needs no small first step.
     resistance, slope = jax.jvp(law.forward, (jnp.zeros_like(p.m1),), (jnp.ones_like(p.m1),))
-    friction_rate = 2.0 * p.g * jnp.abs(slope) / jnp.where(resistance > 0.0, resistance, jnp.inf)
+    friction_rate = 2.0 * p.g * jnp.abs(slope) / jnp.where(resistance > 0.0, resistance, jnp.inf)  # pyright: ignore[reportOperatorIssue]
     springs, d = [force.elastic for force in forces_of(p)], widths.penetration + jnp.zeros_like(p.m1)
     stiffness = jax.jvp(lambda d: total(elastic(d) for elastic in springs), (d,), (jnp.ones_like(d),))[1]
     fastest = jnp.sqrt(jnp.abs(stiffness) * lightness) + p.c * lightness + e.frequency() + friction_rate

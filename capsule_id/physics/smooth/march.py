@@ -388,7 +388,7 @@ def _tangent_maps(
             lanes, d_y, out = carry
             function, after, held = piece(lanes)
             d_y, d_samples = jax.jvp(function, (system, lanes.y), (tangent[0], d_y))[1]
-            return after, d_y, jnp.where(held[None], d_samples, out)
+            return after, d_y, jnp.where(held[None], d_samples, out)  # pyright: ignore[reportReturnType]
 
         first = jnp.zeros((4, *times.shape)).at[:, :, 0].set(tangent[1])
         carry = (initial_lanes(build(system), times, y), tangent[1], first)
