@@ -65,7 +65,7 @@ def replace_files(contents: Mapping[Path, bytes | str], needed: int = 0) -> None
         for path, file in zip(new, files, strict=True):
             with writing(file):
                 path.replace(file)
-    except OutputError:
+    except BaseException:  # of an interrupt too
         for path in new:
             with suppress(OSError):
                 path.unlink()

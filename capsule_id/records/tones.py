@@ -162,7 +162,8 @@ def fit_harmonic(time: Record, values: Record, Omega: float) -> Harmonic:
         strongest = 2.0 * np.pi * dominant_frequency(time, values)
         near = abs(strongest - Omega) < _search_half_width(time)
         guesses = [strongest] if near else [Omega, strongest]
-    (found, left), (other, less) = (_refine(time, values, guess) for guess in (guesses[0], guesses[-1]))
+    ends = [_refine(time, values, guess) for guess in guesses]
+    (found, left), (other, less) = ends[0], ends[-1]
     # In a coarse record the stated frequency and its alias fit equally well: prefer the stated one.
     better = left - less > _significant_reduction(len(time)) * less
     return _harmonic_at(time, values, other if better else found, Omega)
