@@ -11,7 +11,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from capsule_id.errors import InputError, OutputError, refusing, writing
+from capsule_id.errors import InputError, refusing, writing
 
 #: Files of a result directory. A directory with another file is never replaced.
 RESULT_FILES = frozenset({"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"})

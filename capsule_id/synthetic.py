@@ -119,8 +119,10 @@ def _check_new(folder: Path) -> None:
 def _write(folder: Path, tables: Mapping[str, Mapping[str, Any]], rig: str, known: Mapping[str, Any]) -> None:
     """Write tables by file name, the text of ``rig.toml`` and, beside the folder, what is known; on a full disk no file."""
     folder.mkdir(parents=True, exist_ok=True)
-    form = {"index": False, "float_format": "%.9g", "na_rep": "nan", "lineterminator": "\n"}
-    contents = {folder / file: pd.DataFrame(columns).to_csv(**form) for file, columns in tables.items()}
+    contents = {
+        folder / file: pd.DataFrame(columns).to_csv(index=False, float_format="%.9g", na_rep="nan", lineterminator="\n")
+        for file, columns in tables.items()
+    }
     replace_files({**contents, folder / "rig.toml": rig, _truth_file(folder): json.dumps(known, indent=1) + "\n"})
 
 

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import emcee
@@ -16,7 +15,7 @@ import xarray as xr
 
 from capsule_id.cli import fit_params
 from capsule_id.console import Progress
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.output import CHAINS
 from tests.cli_tools import CODE, environment, listing, same_result, small_rig
 
@@ -217,7 +216,7 @@ def test_resume_refuses_what_has_changed(
         assert "the same versions" in capsys.readouterr().err
     with monkeypatch.context() as patch:
         kinds = default_registry()
-        with_package = replace(kinds, packages={**kinds.packages, "rolling-rig": "0.2"})
+        with_package = Registry(kinds.kinds, {**kinds.packages, "rolling-rig": "0.2"})
         patch.setattr("capsule_id.commands.fit.default_registry", lambda: with_package)
         assert fit_params([*WORDS, "--out", "out", "--resume"]) == 2
         assert "the same versions" in capsys.readouterr().err

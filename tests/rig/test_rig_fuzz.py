@@ -141,7 +141,11 @@ def kind_of_end(read: Callable[[bytes, Path], RawTable], content: bytes) -> str:
     """How the reading of a spoiled table ends."""
     began = time.process_time()
     try:
-        end = "read" if read(content, Path("a.csv")).values.tolist() == by_hand(content) else "other numbers"
+        end = (
+            "read"
+            if np.column_stack(read(content, Path("a.csv")).columns).tolist() == by_hand(content)
+            else "other numbers"
+        )
     except InputError:
         end = "refused"
     except Exception:  # whatever a reader may raise
