@@ -229,10 +229,9 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
     The law in use fails where another one has a marginal likelihood ``FACTOR`` times larger, or where its residuals are
     ordered by speed.
     """
-    experiments = [e for e in experiments if e.speeds_known]
-    if not experiments:
-        return []
-    in_use = replace(experiments[0].friction, direction="both")
+    # Laws that depend on the speed can be compared where each reading has one.
+    experiments = [e for e in experiments if e.role == "static" or "speed" in e.table.columns]
+    in_use = replace(experiments[0].friction, direction="both") if experiments else FrictionModel()
     if in_use.law is not CoulombStribeck or sum(e.n for e in experiments if e.role != "static") < FEWEST_SLIDES:
         return []
     points = VariantPoints(experiments)
