@@ -227,9 +227,7 @@ def _encode(value: object, arrays: dict[str, np.ndarray]) -> Any:
             columns = [[inner(name), str(column.dtype), inner(column.tolist())] for name, column in value.items()]
             rest = {"name": inner(value.index.name), "rows": len(value), "columns": columns}
             return {"frame": {"index": index, **rest}}
-        case type():
-            return {"class": [value.__module__, value.__qualname__]}
-        case _ if is_dataclass(value):
+        case _ if is_dataclass(value) and not isinstance(value, type):
             kind = type(value)
             return {
                 "object": [
@@ -266,8 +264,6 @@ def _decode(node: Any, arrays: Mapping[str, np.ndarray], roots: set[str]) -> Any
             labels = pd.RangeIndex(rows) if index is None else pd.Index(inner(index))
             read = {inner(key): pd.Series(inner(values), labels, dtype) for key, dtype, values in columns}
             return pd.DataFrame(read, labels).rename_axis(inner(name))
-        case {"class": names}:
-            return _class(names, roots)
         case {"object": [*names, own]}:
             return _class(names, roots)(**{key: inner(part) for key, part in own.items()})
         case {"map": pairs}:

@@ -43,7 +43,7 @@ def savitzky_golay(
     values : (n,)
     window : s, rounded to the nearest odd number of samples (see ``window_samples``)
     order : of the polynomial
-    derivative : 0 to smooth, 1 for the rate in values per second, ...
+    derivative : 0 to smooth, 1 for the rate in values per second, ... up to ``order``
 
     Returns
     -------
@@ -54,10 +54,6 @@ def savitzky_golay(
     InputError
         If the samples are unevenly spaced, or the window holds too few or too many samples.
     """
-    if not 0 <= derivative <= order:
-        raise InputError(
-            "derivative must lie between 0 and the order of the filter", f"{derivative} of {order}", "raise the order"
-        )
     step = sampling_step(time)
     samples = window_samples(window, step)
     _check_window(samples, order, len(time))
