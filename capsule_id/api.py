@@ -47,8 +47,7 @@ from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import subfigure_at
 from capsule_id.report.html import summary_html
 from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
-from capsule_id.report.netcdf import data_tree
-from capsule_id.report.write import load_fields, result_files, table_frame, write_result
+from capsule_id.report.write import data_tree, load_fields, result_files, table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding, Level, ResultTable
