@@ -161,18 +161,9 @@ class Fit(Result):
             If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter or the gap is missing.
         """
         chosen = self._draws(draws, seed)
-        stated = {name: self.rig.mass(name) for name in ("m1", "m2") if getattr(self.rig, name) is not None}
-        ground = {name: q.value for name, q in (("slope", self.rig.slope), ("N0", self.rig.N0)) if q is not None}
-        values = {
-            **stated,
-            **self.fixed,
-            **ground,
-            "g": self.rig.g.value,
-            "k2": 0.0,
-            "G": gap,
-            **chosen,
-            **(given or {}),
-        }
+        rig = {name: getattr(self.rig, name) for name in ("m1", "m2", "g", "slope", "N0")}
+        stated = {name: quantity.value for name, quantity in rig.items() if quantity is not None}
+        values = {**stated, **self.fixed, "k2": 0.0, "G": gap, **chosen, **(given or {})}
         if spring is not None:
             springs = by_index("k2", chosen)
             if spring not in springs:

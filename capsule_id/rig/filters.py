@@ -8,6 +8,8 @@ Sources: A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627 (1964); gain: R. W. S
 111 (2011).
 """
 
+from bisect import bisect_left
+
 import numpy as np
 from jaxtyping import Float, Int, Num
 from numpy.polynomial import legendre
@@ -176,17 +178,11 @@ def choose_window(time: Record, values: Record, order: int) -> float:
     """
     step = sampling_step(time)
     frequency = dominant_frequency(time, values) * step
-    samples = order + 1 + order % 2
-    _check_window(samples, order, len(time))
-    # Bisection: the gain falls monotonically from 1 to the stop band, whose ripple is far below 1.
-    too_long = len(time) + 1 + len(time) % 2
-    while too_long - samples > 2:
-        middle = samples + 2 * ((too_long - samples) // 4)
-        if filter_gain(frequency, middle, order) >= SMALLEST_GAIN:
-            samples = middle
-        else:
-            too_long = middle
-    return samples * step
+    windows = range(order + 1 + order % 2, len(time) + 1, 2)
+    _check_window(windows.start, order, len(time))
+    # The gain falls monotonically from 1 to the stop band, whose ripple is far below 1.
+    too_long = bisect_left(windows, 1, 1, key=lambda samples: filter_gain(frequency, samples, order) < SMALLEST_GAIN)
+    return windows[too_long - 1] * step
 
 
 def dominant_frequency(time: Record, values: Record) -> float:

@@ -25,7 +25,9 @@ from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
 # headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
 
 
-_WORDS = {
+#: Words for a column of a kind, without accents, by its name; a column is always known by its own name too. Words for
+#: the uncertainty of any, and parts of the names of frictions.
+WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in {
     "time": "time t zeit messzeit temps tiempo tempo elapsed timestamp clock value duree instant istante "
     "instante zeitstempel",
     "x_rel": "relative displacement disp deflection position pos x s weg laser distance abstand auslenkung "
@@ -69,10 +71,7 @@ _WORDS = {
     "deslizamiento scorrimento",
     "reading": "reading counts adc raw cell messwert ablesung lecture lectura lettura signal output anzeige "
     "digits",
-}  # fmt: skip
-#: Words for a column of a kind, without accents, by its name; a column is always known by its own name too. Words for
-#: the uncertainty of any, and parts of the names of frictions.
-WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in _WORDS.items()}
+}.items()}  # fmt: skip
 #: Names of the same quantity.
 SAME = {"acceleration_rod": "acceleration", "slope": "angle"}
 #: Fewest letters of a word that can end a compound, and shorter words that can.
