@@ -201,7 +201,7 @@ def _write_labels(ax: Axes, x: np.ndarray, label: np.ndarray) -> None:
     small: dict[str, Any] = {"fontsize": SMALL - 1.5, "ha": "center", "va": "center", "rotation": 90}
     begins = [0, *(1 + np.flatnonzero(label[1:] != label[:-1])), len(label)]
     for begin, end in pairwise(begins):
-        left, right = edges[begin], edges[end]
+        left, right = float(edges[begin]), float(edges[end])
         if begin > 0:
             ax.axvline(left, ymin=0.79, ymax=0.97, color=GREY, lw=0.7)
         if right - left >= _ROOM_FOR_LABEL * (x[-1] - x[0]):
