@@ -47,8 +47,7 @@ from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import subfigure_at
 from capsule_id.report.html import summary_html
 from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
-from capsule_id.report.netcdf import data_tree
-from capsule_id.report.write import load_fields, result_files, table_frame, write_result
+from capsule_id.report.write import data_tree, load_fields, result_files, table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding, Level, ResultTable
@@ -162,18 +161,9 @@ class Fit(Result):
             If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter or the gap is missing.
         """
         chosen = self._draws(draws, seed)
-        stated = {name: self.rig.mass(name) for name in ("m1", "m2") if getattr(self.rig, name) is not None}
-        ground = {name: q.value for name, q in (("slope", self.rig.slope), ("N0", self.rig.N0)) if q is not None}
-        values = {
-            **stated,
-            **self.fixed,
-            **ground,
-            "g": self.rig.g.value,
-            "k2": 0.0,
-            "G": gap,
-            **chosen,
-            **(given or {}),
-        }
+        rig = {name: getattr(self.rig, name) for name in ("m1", "m2", "g", "slope", "N0")}
+        stated = {name: quantity.value for name, quantity in rig.items() if quantity is not None}
+        values = {**stated, **self.fixed, "k2": 0.0, "G": gap, **chosen, **(given or {})}
         if spring is not None:
             springs = by_index("k2", chosen)
             if spring not in springs:

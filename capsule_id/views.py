@@ -50,12 +50,9 @@ class _Texts(Formatter):
         return stated_p(value) if format_spec == "p" else format(value, format_spec)
 
 
-_TEXTS = _Texts()
-
-
 def filled_in(text: str, facts: Facts) -> str:
     """``text`` with its ``{names}`` replaced by facts; formats as of ``str.format``, and ``# noun`` and ``p``."""
-    return _TEXTS.vformat(text, (), facts)
+    return _Texts().vformat(text, (), facts)
 
 
 @dataclass(frozen=True)

@@ -217,7 +217,7 @@ def run(args: argparse.Namespace) -> int:
     prepare_jax(not args.no_cache)
     from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.report.figures.style import own_style, png
-    from capsule_id.report.netcdf import netcdf_bytes
+    from capsule_id.report.write import netcdf_bytes
 
     with Progress(not args.quiet, unit="point") as progress, client_of(args.scheduler) as client:
         data = _dataset(args, axes, values, {"store": store, "client": client, "progress": progress})
@@ -262,7 +262,7 @@ def _dataset(
     """The Dataset for the options."""
     from capsule_id.motions import sweep
     from capsule_id.motions.response import Settling
-    from capsule_id.report.netcdf import read_draws
+    from capsule_id.report.write import read_draws
 
     settling = Settling(
         dropped=_whole_number("dropped", args.dropped),

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,15 @@ if TYPE_CHECKING:
 
 WIDTHS = {"velocity": "m/s", "penetration": "m", "rounding": "fraction of the break-away force", "tolerance": "1"}
 PICTURE_SAMPLES = 20_000
-STATE = {"X1": "m", "Y1": "m/s", "X2": "m", "Y2": "m/s"}
+#: Unit and meaning of the columns of a motion, the state first.
+COLUMNS = {
+    "X1": ("m", "displacement of the rod"),
+    "Y1": ("m/s", "velocity of the rod"),
+    "X2": ("m", "displacement of the capsule"),
+    "Y2": ("m/s", "velocity of the capsule"),
+    "x_rel": ("m", "X1 - X2, positive towards the support spring"),
+}
+STATE = tuple(COLUMNS)[:4]
 
 
 OPTIONS = {
@@ -29,7 +38,7 @@ OPTIONS = {
         ("--periods", "N", "length in excitation periods (default 20)"),
         ("--duration", "X", "length in s, instead of --periods"),
         ("--samples", "N", "number of samples (default 2000)", {"default": "2000"}),
-        ("--initial", tuple(STATE), "state at the start, m and m/s (default: rest)", {"nargs": 4}),
+        ("--initial", STATE, "state at the start, m and m/s (default: rest)", {"nargs": 4}),
     ),
     "model": (
         ("--model", None, "event-driven or smoothed", {"choices": ["exact", "smooth"], "default": "exact"}),
@@ -69,7 +78,6 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.physics.model import Status, status_message
     from capsule_id.physics.simulation import simulate
     from capsule_id.physics.smooth.engine import Smoothing
-    from capsule_id.report.netcdf import write_motion
 
     p, e = capsule_and_drive(values, args.drive)
     grid = np.linspace(0.0, end, samples)
@@ -87,9 +95,9 @@ def run(args: argparse.Namespace) -> int:
         complain(f"capsule-id simulate: {status_message(t.status)}")
     warn_of_far_gap(p.G, t.x_rel)
     held = np.isin(times, grid)
-    columns = {"time": times[held]} | {name: np.asarray(getattr(t, name))[held] for name in (*STATE, "x_rel")}
+    columns = {name: np.asarray(getattr(t, name))[held] for name in COLUMNS}
     with refusing("the output must be writable", "choose another name", args.out):
-        write_motion(args.out, columns, values | {"model": args.model, "semantics": args.semantics})
+        _write(args.out, times[held], columns, values | {"model": args.model, "semantics": args.semantics})
     if args.figure is not None:
         with refusing("the output must be writable", "choose another name", args.figure):
             _draw(args.figure, t, np.isin(times, section), values["G"])
@@ -115,6 +123,27 @@ def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]
     if not end > 0.0:
         raise InputError("the length must be positive", text, "give a positive number")
     return end, int(samples)
+
+
+def _write(
+    path: Path, time: np.ndarray, columns: Mapping[str, np.ndarray], provenance: Mapping[str, float | str]
+) -> None:
+    """Write the motion, (n,) SI, as CSV with ``name [unit]`` headers or as NetCDF; numbers keep all their digits.
+
+    provenance : parameters and model; attributes of the NetCDF file (a CSV file holds the table alone)
+    """
+    import pandas as pd
+    import xarray as xr
+
+    from capsule_id.report.write import netcdf_bytes
+
+    if path.suffix == ".csv":
+        table = {"time [s]": time} | {f"{name} [{COLUMNS[name][0]}]": values for name, values in columns.items()}
+        replace_file(path, pd.DataFrame(table).to_csv(index=False, lineterminator="\n"))
+        return
+    about = {name: {"units": unit, "long_name": meaning} for name, (unit, meaning) in COLUMNS.items()}
+    data = {name: ("time", values, about[name]) for name, values in columns.items()}
+    replace_file(path, netcdf_bytes(xr.Dataset(data, {"time": ("time", time, {"units": "s"})}, dict(provenance))))
 
 
 def _draw(path: Path, t: "Trajectory", section: np.ndarray, G: float) -> None:

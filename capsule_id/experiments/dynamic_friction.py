@@ -229,23 +229,18 @@ class DynamicFriction(FrictionExperiment):
     def change(self, theta: ValuesBySymbol) -> Any:
         return self.track(theta).change(self.coefficient(theta), self.readings["speed"])
 
-    @property
-    def stated_track(self) -> Track:
-        """``track`` at the stated values."""
-        return self.track(self.stated)
-
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Points by the paper's formula: mu = v^2/(2gd) at the initial speed."""
         speed = self.readings["speed"]
-        return speed, self.stated_track.coefficient(speed, self.observed)
+        return speed, self.track(self.stated).coefficient(speed, self.observed)
 
     def paper_coefficient(self, law: FrictionLaw) -> Any:
-        speed, track = self.readings["speed"], self.stated_track
+        speed, track = self.readings["speed"], self.track(self.stated)
         return track.coefficient(speed, track.distance(law, speed))
 
     def point_errors(self) -> tuple[np.ndarray, float]:
         speed, mu = self.paper_points()
         relative = np.hypot(self.sds["distance"] / self.observed, 2.0 * self.sds["speed"] / speed)
         # The reading shows friction and the weight along the slope together.
-        track = self.stated_track
+        track = self.track(self.stated)
         return relative * (1.0 + track.along / (track.normal * mu)), 1.0

@@ -305,11 +305,6 @@ class FrictionExperiment(PointTest):
         return () if self.role == "static" and self.friction.law is CoulombStribeck else self.friction.masses
 
     @property
-    def speeds_known(self) -> bool:
-        """Whether each reading has a speed, so that laws that depend on it can be compared."""
-        return self.role == "static" or "speed" in self.table.columns
-
-    @property
     def backward(self) -> bool:
         """Whether the capsule slides away from the support spring, which is downhill for slope > 0."""
         return self.friction.direction == "backward"

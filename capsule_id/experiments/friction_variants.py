@@ -88,13 +88,13 @@ class VariantPoints:
         rig = experiments[0].rig
         weighed = rig.m1 is not None and rig.m2 is not None
         self.normal_forces = [e.stated_normal_force if weighed else np.nan for e in experiments]
-        self.priors = rig.priors
 
     def rows(self, model: FrictionModel) -> list[Parameter]:
         """The law's parameters, then the scatters, with the priors of the fit."""
         scatters = {row.symbol: row for e in self.experiments for row in e.parameters if row.symbol == e.scatter.symbol}
         rows = [*model.parameters, *scatters.values()]
-        return [row if row.name not in self.priors else row.named(row.of, self.priors[row.name]) for row in rows]
+        stated = self.experiments[0].rig.priors
+        return [row.named(row.of, stated.get(row.name)) for row in rows]
 
     def scaled(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Differences of log-coefficients and their sd, (s, n) each, at ``theta``: (s,) by symbol."""
@@ -169,29 +169,14 @@ def sequential_monte_carlo(
         )
         position = (rng.random() + np.arange(particles)) / particles * np.sum(weight)
         chosen = np.minimum(np.searchsorted(np.cumsum(weight), position), particles - 1)
-        z, value = _metropolis(density, (z[chosen], value[chosen]), power, root, rng)
+        z, value = z[chosen], value[chosen]
+        for scale in np.geomspace(1.0, 0.1, MOVES):
+            proposed = z + scale * 2.38 / np.sqrt(dimension) * rng.standard_normal(z.shape) @ root.T
+            new = density(proposed)
+            change = power * (new - value) - 0.5 * np.sum(proposed**2 - z**2, axis=1)
+            accepted = np.log(rng.random(particles)) < change
+            z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
     return z, value, evidence
-
-
-def _metropolis(
-    density: Callable[[np.ndarray], np.ndarray],
-    particles: tuple[np.ndarray, np.ndarray],
-    power: float,
-    root: np.ndarray,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Move ``particles``, z (s, d) with their log-likelihoods (s,), by ``MOVES`` steps of the Metropolis rule.
-
-    root : (d, d) Cholesky factor of the covariance of z
-    """
-    z, value = particles
-    for scale in np.geomspace(1.0, 0.1, MOVES):
-        proposed = z + scale * 2.38 / np.sqrt(z.shape[1]) * rng.standard_normal(z.shape) @ root.T
-        new = density(proposed)
-        change = power * (new - value) - 0.5 * np.sum(proposed**2 - z**2, axis=1)
-        accepted = np.log(rng.random(len(z))) < change
-        z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
-    return z, value
 
 
 def order_p(residuals: np.ndarray, rng: np.random.Generator) -> float:
@@ -244,10 +229,9 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
     The law in use fails where another one has a marginal likelihood ``FACTOR`` times larger, or where its residuals are
     ordered by speed.
     """
-    experiments = [e for e in experiments if e.speeds_known]
-    if not experiments:
-        return []
-    in_use = replace(experiments[0].friction, direction="both")
+    # Laws that depend on the speed can be compared where each reading has one.
+    experiments = [e for e in experiments if e.role == "static" or "speed" in e.table.columns]
+    in_use = replace(experiments[0].friction, direction="both") if experiments else FrictionModel()
     if in_use.law is not CoulombStribeck or sum(e.n for e in experiments if e.role != "static") < FEWEST_SLIDES:
         return []
     points = VariantPoints(experiments)

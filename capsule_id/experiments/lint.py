@@ -101,9 +101,10 @@ class Number:
 
     def unusual(self, rig: Rig) -> Iterable[Finding]:
         """Warn where the value lies outside the interval and ``rig`` does not confirm every scale."""
-        low, high = self.usual
+        (low, high), written = self.usual, abs(self.value) * self.to_display
         if self.value == 0.0 or low <= abs(self.value) <= high or set(self.scales) <= set(rig.confirmed):
             return
+        units = _ALTERNATIVES.get(self.si, ()) if len(self.scales) == 1 else ()
         facts = {
             "name": self.name,
             "value": self.value * self.to_display,
@@ -111,15 +112,10 @@ class Number:
             "high": high * self.to_display,
             "unit": self.unit or self.si,
             "scales": self.scales,
-            "meant": self._meant(),
+            # The likeliest unit in which the written number would be usual.
+            "meant": next((unit for unit in units if low <= written * factor_to_si(unit, self.si) <= high), ""),
         }
         yield Finding(self.code, "warn", facts, self.label)
-
-    def _meant(self) -> str:
-        """The likeliest unit in which the written number would be usual; "" where there is none."""
-        written, (low, high) = abs(self.value) * self.to_display, self.usual
-        units = _ALTERNATIVES.get(self.si, ()) if len(self.scales) == 1 else ()
-        return next((unit for unit in units if low <= written * factor_to_si(unit, self.si) <= high), "")
 
 
 def lint_rig_quantities(rig: Rig) -> Iterable[Finding]:

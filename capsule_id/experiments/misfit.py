@@ -142,7 +142,7 @@ class ScaledMisfit:
         y, a = self.raw / self.sd, self.design / self.sd[:, None]
         size = np.diff(np.append(first, len(y)))
         yy, ay = np.add.reduceat(y**2, first), np.add.reduceat(a * y[:, None], first)
-        aa = np.stack([part.T @ part for part in np.split(a, first[1:])])
+        aa = np.add.reduceat(a[:, :, None] * a[:, None, :], first)
         whole = marginal_log_density(np.sum(yy), np.sum(ay, axis=0), np.sum(aa, axis=0), len(y), np)
         others = _sum_of_others(yy), _sum_of_others(ay), _sum_of_others(aa)
         rest = marginal_log_density(*others, len(y) - size, np)

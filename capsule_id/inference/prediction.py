@@ -18,7 +18,7 @@ from capsule_id.inference.result import PointFit, Result
 from capsule_id.inference.sampling import Emulation, ExactMotions, adapted_proposal, emulation, laplace_proposal
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Column, Table
-from capsule_id.rig.tables import read_settings
+from capsule_id.rig.read import read_settings
 from capsule_id.views import Comparison, counted
 
 #: Draws of the posterior; the ends of the 95 % interval then have a standard error of a tenth of its sd.

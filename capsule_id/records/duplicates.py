@@ -65,7 +65,7 @@ class Repeated:
 
 def reading_step(values: np.ndarray) -> float:
     """Reading step of ``values`` (n,), in their unit: a power of ten, or the spacing of their levels; 0 without one."""
-    scale = _largest(values)
+    scale = float(np.max(np.abs(values), initial=0.0))
     if scale == 0.0:
         return 0.0
     values = thinned(values)
@@ -83,11 +83,6 @@ def reading_step(values: np.ndarray) -> float:
     return next((10.0**-k for k in fits), 0.0)
 
 
-def _largest(values: np.ndarray) -> float:
-    """Largest magnitude; 0 without values."""
-    return max(float(np.max(values)), -float(np.min(values))) if len(values) else 0.0
-
-
 def chance_of_equality(readings: Readings) -> float:
     """Probability that two independent rows agree in all columns; 1 where the reading step hides the scatter."""
     chance = 1.0
@@ -98,8 +93,9 @@ def chance_of_equality(readings: Readings) -> float:
         if readings.record and len(values) >= SHORTEST_RECORD:
             step, width = max(step, _uneven_spacing(values, step)), WIDTH * noise_level(values)
         # A step of 0 is that of float64.
-        own = min(1.0, max(step, 4e-16 * _largest(values)) / width) if width > 0.0 else 1.0
-        chance *= own if readings.record else max(own, _set_share(values, readings.values))
+        own = min(1.0, max(step, 4e-16 * float(np.max(np.abs(values)))) / width) if width > 0.0 else 1.0
+        # Rows that agree in one column but not in all show a setting that recurs, such as a load.
+        chance *= own if readings.record else max(own, _equal_share(values) - _equal_share(readings.values))
     return chance
 
 
@@ -115,11 +111,10 @@ def _uneven_spacing(values: np.ndarray, step: float) -> float:
     return float(np.mean(gaps[gaps <= LARGE_GAP * np.quantile(gaps, 0.75)])) if uneven else 0.0
 
 
-def _set_share(column: np.ndarray, rows: np.ndarray) -> float:
-    """Share of the pairs of rows that agree in one column (n,) but not in all: a setting such as a load recurs."""
-    counts = [np.unique(each, axis=0, return_counts=True)[1] for each in (column, rows)]
-    alike, equal = (int(np.sum(n * (n - 1))) for n in counts)
-    return (alike - equal) / max(len(column) * (len(column) - 1), 1)
+def _equal_share(rows: np.ndarray) -> float:
+    """Share of the pairs of rows (n,) or (n, columns) that are equal."""
+    sizes, number = np.unique(rows, axis=0, return_counts=True)[1], len(rows)
+    return float(np.sum(sizes * (sizes - 1)) / max(number * (number - 1), 1))
 
 
 def repeated_blocks(tables: Sequence[Readings]) -> list[Repeated]:
@@ -200,21 +195,13 @@ def _longest_block(earlier: Readings, later: Readings, chance: float) -> Repeate
             where, start = where - back, start - back
         count = _equal_rows(earlier.values[where:], later.values[start:])
         ends[start - where] = start + count
-        if not later.record and pairs * _chance_within(later.values[start : start + count]) > CHANCE:
+        # Trials of one load that are read in coarse steps agree, even where the whole table looks fine: the rows of the
+        # block itself show how often rows are equal.
+        if not later.record and pairs * _equal_share(later.values[start : start + count]) ** count > CHANCE:
             continue
         if count >= shortest and (best is None or count > best.count):
             best = Repeated(later.label, start, earlier.label, where, count)
     return best
-
-
-def _chance_within(block: np.ndarray) -> float:
-    """Probability that a block (n, columns) of single readings recurs, if its own rows show how often rows are equal.
-
-    Trials of one load that are read in coarse steps agree, even where the coefficients of the whole table look fine.
-    """
-    _, sizes = np.unique(block, axis=0, return_counts=True)
-    rows = len(block)
-    return float(np.sum(sizes * (sizes - 1)) / max(rows * (rows - 1), 1)) ** rows
 
 
 def _equal_rows(one: np.ndarray, other: np.ndarray) -> int:

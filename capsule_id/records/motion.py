@@ -258,7 +258,7 @@ class Cycle:
 def find_contacts(cycle: Cycle) -> Contacts:
     """Count the contacts of a record whose motion has the period ``cycle.period``."""
     push = _shortfall(cycle)
-    seen = _impact_line(cycle, push)
+    seen = _impact_line(cycle, push) if push else None
     line = seen or ImpactLine(cycle.gap, cycle.gap_sd, cycle.noise_sd)
     single = cycle.x_rel - line.value
     mean, sd = cycle.mean(cycle.x_rel)
@@ -350,10 +350,8 @@ def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
     return below & (distance > _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega)
 
 
-def _impact_line(cycle: Cycle, push: _Shortfall | None) -> ImpactLine | None:
+def _impact_line(cycle: Cycle, push: _Shortfall) -> ImpactLine | None:
     """The x_rel at which the spikes vanish, by regression of x_rel on them."""
-    if push is None:
-        return None
     (force, sd), (x_rel, _) = cycle.mean(push.shortfall), cycle.mean(cycle.x_rel)
     deep = force > _CONTACT_STANDARD_ERRORS * sd * push.sd
     # A mean across an edge of a contact is biased: drop half a sampling step on either side.

@@ -103,7 +103,9 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
     x_rel, rate = (savitzky_golay(time, table["x_rel"], samples * step, FILTER_ORDER, d) for d in (0, 1))
     phase = evidence.drive.phase if evidence.drive else 0.0
     half = samples // 2
-    section = _section_times(time[half : len(time) - half], evidence.Omega, phase)
+    # Times between the half windows at which Omega t + phase is a multiple of 2 pi.
+    first, last = (evidence.Omega * time[[half, len(time) - half - 1]] + phase) / (2.0 * np.pi)
+    section = (2.0 * np.pi * np.arange(np.ceil(first), np.floor(last) + 1.0) - phase) / evidence.Omega
     return RecordView(
         label=motion.label,
         probability=motion.probability,
@@ -134,12 +136,6 @@ def _gains(f: float, step: float, samples: int) -> Gains:
     return Gains(f, *(float(filter_gain(f * step, samples, FILTER_ORDER, d)) for d in (0, 1)))
 
 
-def _section_times(time: np.ndarray, Omega: float, phase: float) -> np.ndarray:
-    """Times within the record at which Omega t + phase is a multiple of 2 pi."""
-    first, last = ((Omega * t + phase) / (2.0 * np.pi) for t in (time[0], time[-1]))
-    return (2.0 * np.pi * np.arange(np.ceil(first), np.floor(last) + 1.0) - phase) / Omega
-
-
 # run description: Describes a recorded run in a few lines of text: label with evidence, drive, filter.
 
 
@@ -147,7 +143,8 @@ def describe_run(table: Table) -> list[str]:
     """Lines about a ``forced_run``, without its label."""
     motion = measured_motion(table)
     evidence = "; ".join(_evidence(motion))
-    lines = [f"motion {label_text(motion)} ({evidence})" if evidence else f"motion {motion.label}"]
+    probability = "" if motion.label == UNDECIDED or not evidence else f", probability {motion.probability:.2g}"
+    lines = [f"motion {motion.label}{probability}{f' ({evidence})' * bool(evidence)}"]
     if motion.evidence.reasons:
         part = "undecided" if motion.label == UNDECIDED else "the rest of the label is undecided"
         lines.append(f"{part}: {'; '.join(motion.evidence.reasons)}")
@@ -163,11 +160,6 @@ def describe_run(table: Table) -> list[str]:
     gains = [("drive", view.at_drive), *([("contacts", view.at_contact)] if view.at_contact else [])]
     passed = ", ".join(f"{g.smoothing:.3f} (rate {g.rate:.3f}) at {g.f:.3g} Hz, {name}" for name, g in gains)
     return [*lines, f"Savitzky-Golay over {view.samples} samples, order {FILTER_ORDER}: gain {passed}"]
-
-
-def label_text(motion: MeasuredMotion) -> str:
-    """The label and, where it is decided, its probability."""
-    return motion.label if motion.label == UNDECIDED else f"{motion.label}, probability {motion.probability:.2g}"
 
 
 def _evidence(motion: MeasuredMotion) -> Iterator[str]:

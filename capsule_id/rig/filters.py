@@ -8,6 +8,8 @@ Sources: A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627 (1964); gain: R. W. S
 111 (2011).
 """
 
+from bisect import bisect_left
+
 import numpy as np
 from jaxtyping import Float, Int, Num
 from numpy.polynomial import legendre
@@ -43,7 +45,7 @@ def savitzky_golay(
     values : (n,)
     window : s, rounded to the nearest odd number of samples (see ``window_samples``)
     order : of the polynomial
-    derivative : 0 to smooth, 1 for the rate in values per second, ...
+    derivative : 0 to smooth, 1 for the rate in values per second, ... up to ``order``
 
     Returns
     -------
@@ -54,10 +56,6 @@ def savitzky_golay(
     InputError
         If the samples are unevenly spaced, or the window holds too few or too many samples.
     """
-    if not 0 <= derivative <= order:
-        raise InputError(
-            "derivative must lie between 0 and the order of the filter", f"{derivative} of {order}", "raise the order"
-        )
     step = sampling_step(time)
     samples = window_samples(window, step)
     _check_window(samples, order, len(time))
@@ -180,17 +178,11 @@ def choose_window(time: Record, values: Record, order: int) -> float:
     """
     step = sampling_step(time)
     frequency = dominant_frequency(time, values) * step
-    samples = order + 1 + order % 2
-    _check_window(samples, order, len(time))
-    # Bisection: the gain falls monotonically from 1 to the stop band, whose ripple is far below 1.
-    too_long = len(time) + 1 + len(time) % 2
-    while too_long - samples > 2:
-        middle = samples + 2 * ((too_long - samples) // 4)
-        if filter_gain(frequency, middle, order) >= SMALLEST_GAIN:
-            samples = middle
-        else:
-            too_long = middle
-    return samples * step
+    windows = range(order + 1 + order % 2, len(time) + 1, 2)
+    _check_window(windows.start, order, len(time))
+    # The gain falls monotonically from 1 to the stop band, whose ripple is far below 1.
+    too_long = bisect_left(windows, 1, 1, key=lambda samples: filter_gain(frequency, samples, order) < SMALLEST_GAIN)
+    return windows[too_long - 1] * step
 
 
 def dominant_frequency(time: Record, values: Record) -> float:

@@ -4,6 +4,7 @@ import json
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby, islice, pairwise, product
 from pathlib import Path
@@ -24,7 +25,9 @@ from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
 # headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
 
 
-_WORDS = {
+#: Words for a column of a kind, without accents, by its name; a column is always known by its own name too. Words for
+#: the uncertainty of any, and parts of the names of frictions.
+WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in {
     "time": "time t zeit messzeit temps tiempo tempo elapsed timestamp clock value duree instant istante "
     "instante zeitstempel",
     "x_rel": "relative displacement disp deflection position pos x s weg laser distance abstand auslenkung "
@@ -68,10 +71,7 @@ _WORDS = {
     "deslizamiento scorrimento",
     "reading": "reading counts adc raw cell messwert ablesung lecture lectura lettura signal output anzeige "
     "digits",
-}  # fmt: skip
-#: Words for a column of a kind, without accents, by its name; a column is always known by its own name too. Words for
-#: the uncertainty of any, and parts of the names of frictions.
-WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in _WORDS.items()}
+}.items()}  # fmt: skip
 #: Names of the same quantity.
 SAME = {"acceleration_rod": "acceleration", "slope": "angle"}
 #: Fewest letters of a word that can end a compound, and shorter words that can.
@@ -98,11 +98,9 @@ def unit_of(text: str, dimensions: Sequence[str]) -> str | None:
     for si in dimensions:
         # A lone g beside an acceleration is standard gravity.
         candidate = "g_n" if written in ("g", "G") and si == "m/s^2" else written
-        try:
+        with suppress(UnitError):
             factor_to_si(candidate, si)
-        except UnitError:
-            continue
-        return candidate
+            return candidate
     return None
 
 
@@ -124,11 +122,9 @@ def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | No
     if found and unit_of(text := found[2] or found[3] or "", dimensions) is not None:
         return f"{found[1]} {found[4]}", text.strip()
     for mark in ("_", "/"):
-        parts = header.split(mark)
-        for k in range(1, len(parts)):
-            suffix = mark.join(parts[k:])
-            if unit_of(suffix, dimensions) is not None:
-                return mark.join(parts[:k]), suffix
+        for place in re.finditer(mark, header):
+            if unit_of(header[place.end() :], dimensions) is not None:
+                return header[: place.start()], header[place.end() :]
     return header, None
 
 

@@ -176,14 +176,10 @@ class Rig:
     def mass(self, symbol: Literal["m1", "m2"]) -> float:
         """Stated mass, kg, for a kind whose ``masses`` contain ``symbol``.
 
-        Raises
-        ------
-        ValueError
-            If it is not stated; ``read_rig`` refuses such a folder.
+        ``read_rig`` refuses a folder without it.
         """
         stated: Quantity | None = getattr(self, symbol)
-        if stated is None:
-            raise ValueError(f"{symbol} is not stated; the kind of experiment must list it in its masses")
+        assert stated is not None, f"the kind of experiment must list {symbol} in its masses"
         return stated.value
 
     @property

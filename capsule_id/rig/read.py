@@ -1,11 +1,14 @@
 """Reads a rig folder into a ``Rig``: ``rig.toml`` by the rules of the kinds, tables in SI, rules between tables."""
 
 import hashlib
+import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PureWindowsPath
 from types import MappingProxyType
 from typing import Any
 
@@ -14,12 +17,18 @@ import numpy as np
 from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import Parameter, Prior
-from capsule_id.rig.formats.raw import TextFile
-from capsule_id.rig.maps import MAP_KEYS
-from capsule_id.rig.model import Column, Quantity, Rig, Table
+from capsule_id.rig.filters import FEWEST_PERIODS, clock_starts
+from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
+from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
+from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError
+from capsule_id.rig.guess import find_layout, proposal
+from capsule_id.rig.maps import MAP_KEYS, apply_map, on_reference, read_map
+from capsule_id.rig.model import NO_DRIFT, Column, Quantity, Rig, Settings, Table
+from capsule_id.rig.plateaus import read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
     TABLE_KEYS,
+    ColumnRule,
     Entry,
     KindRule,
     check_engine,
@@ -30,8 +39,12 @@ from capsule_id.rig.schema import (
     read_model,
     read_rules,
 )
-from capsule_id.rig.tables import read_table
-from capsule_id.rig.toml import NAME_PATTERN, Node, closest, parse_toml, shown
+from capsule_id.rig.toml import LARGEST, NAME_PATTERN, SMALLEST, Node, closest, is_plausible, parse_toml, shown
+from capsule_id.rig.units import UnitError, factor_to_si, scale
+from capsule_id.views import counted
+
+# folder: ``rig.toml`` and the rules between its entries.
+
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
 _READING_ERRORS = ("_sd", "_resolution")
@@ -245,3 +258,315 @@ def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
             )
         stated.append(size)
     return replace(column, sd=stated[0], resolution=stated[1])
+
+
+# order: Finds why the times of a table do not increase, and the remedy that cures this cause.
+
+
+#: Largest share of rows with a repeated time where the clock stood still; of rounded times more are repeated.
+STANDS = 0.05
+_MOST_LINES = 20  # named in a remedy
+
+
+def remedy_of_order(raw: RawTable, index: int) -> str:
+    """The cause that keeps column ``index`` from increasing, tested on the rows, and its remedy; else what is seen."""
+    time, name, step = raw.columns[index], raw.names[index], np.diff(raw.columns[index])
+    back = 1 + np.flatnonzero(step <= 0.0)
+    few, falls = len(back) * FEWEST_PERIODS < len(time), bool(np.any(step < 0.0))
+    rising = [
+        other for other, c in zip(raw.names, raw.columns, strict=True) if other != name and np.all(np.diff(c) > 0.0)
+    ]
+    copies = np.setdiff1d(np.arange(len(time)), np.unique(np.column_stack(raw.columns), axis=0, return_index=True)[1])
+    order = np.argsort(time, kind="stable")
+    rough = [sum(float(np.sum(np.abs(np.diff(c[rows])))) for c in raw.columns) for rows in (order, slice(None))]
+    # A clock that stood still makes up for the lost time in one step.
+    levels, counts = np.unique(time, return_counts=True)
+    even = (time[-1] - time[0]) / (len(time) - 1)
+    made_up = np.all(np.abs(np.diff(levels) - counts[:-1] * even)[counts[:-1] > 1] < 0.5 * even)
+    where = f"line {' '.join(map(str, raw.rows[back][:_MOST_LINES]))}{' …' if len(back) > _MOST_LINES else ''}"
+    files, rows = f"at {counted(len(back), 'row')} ({where}): write a file of each record", counted(len(back), "row")
+    still = "the clock stands still and then goes on; delete the rows with a repeated time:"
+    causes = (
+        (rising and not few, f"{' '.join(rising)} increases in every row and {name} does not: exchange the headers of "
+         f"{name} and {' '.join(rising)}, or their from in a column map"),
+        (len(clock_starts(time)) and np.all(step[back - 1] < 0.0), f"the clock starts anew {files}"),
+        (len(copies) and np.all(np.diff(np.delete(time, copies)) > 0.0),
+         f"delete the repeated rows: line {' '.join(map(str, raw.rows[copies]))}"),
+        (not falls and len(back) <= STANDS * len(time) and made_up, f"{still} {where}"),
+        (not falls, f"the times are rounded, up to {counted(int(counts.max()), 'row')} share one: export them with more "
+         "digits"),
+        (len(levels) == len(time) and rough[0] <= rough[1],
+         f"sort the rows by {name}: in that order the readings are smoother"),
+        (few, f"the clock is set back {files}"),
+    )  # fmt: skip
+    other = f"{name} falls or stays in {rows} of {len(time)}: check which column holds the times"
+    return next((text for holds, text in causes if holds), other)
+
+
+# tables: Reads the files of one experiment: path check, bytes, hash, column map, columns in SI.
+
+
+_A_TRIAL = "a row per trial"
+
+
+def table_path(node: Node) -> Path:
+    """The path of the table that ``node`` names, a regular file inside the rig folder.
+
+    Raises
+    ------
+    InputError
+        At the ``file`` key of ``rig.toml``.
+    """
+    folder, name = node.document.path.parent, node.text()
+    remedy = "put the file into the rig folder and write its path relative to that folder"
+    if Path(name).is_absolute() or PureWindowsPath(name).drive or not name.isprintable():
+        raise node.error("file must be a path relative to the rig folder", shown(name), remedy)
+    file = folder / name
+    try:
+        inside = file.resolve().is_relative_to(folder.resolve())
+        exists, regular = file.exists(), file.is_file()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise node.error("file must be a readable file", f"{shown(name)} ({error})", remedy) from None
+    beside = file.parent.glob("*") if inside and not exists else ()
+    near = closest(name, [p.relative_to(folder).as_posix() for p in beside if suffix_of(p) in EXPORTS])
+    for holds, rule, cure in (
+        (inside, "lie inside the rig folder, links followed", remedy),
+        (exists, "exist", f'write "{near}"' if near else "correct the name or add the file"),
+        (regular, "be a regular file", "name a table, not a folder or device"),
+        (suffix_of(file) in EXPORTS, f"be a table of a known kind ({' '.join(EXPORTS)})", "export it as CSV"),
+    ):
+        if not holds:
+            raise node.error(f"file must {rule}", shown(name), cure)
+    return file
+
+
+def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> tuple[Table, RawTable, dict[str, str]]:
+    """The table of an experiment, by its column map if it has one: its columns are checked, still without reading errors.
+
+    Also the table as written, without its numbers, and the sha256 of the bytes read by the names of the files.
+
+    Raises
+    ------
+    InputError
+        At a key of ``rig.toml`` or at a place in a file.
+    """
+    files: dict[str, Path] = {}
+    contents: dict[str, bytes] = {}
+    nodes = _file_nodes(entry)
+    for node in nodes:
+        file, name = table_path(node), node.value
+        if file in files.values():
+            raise node.error("files must be named once", shown(name), "remove the second one")
+        try:
+            files[name], contents[name] = file, file.read_bytes()
+        except OSError as error:
+            raise node.error(
+                "file must be readable", f"{shown(name)} ({error.strerror})", "check its permissions"
+            ) from None
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+    first = files[nodes[0].value]
+    plateaus = read_plateaus(entry, kind)
+    column_map = read_map(entry, kind, partial(_proposal, first, kind))
+    if column_map is None:
+        raw = _read_plain(nodes[0], first, contents.pop(nodes[0].value), kind)
+        encodings = {nodes[0].value: raw.encoding}
+    else:
+        # Plateaus replace the time by the column of their levels.
+        names = tuple(column_map.sources)
+        if plateaus is not None:
+            names = (*(name for name in names if name != "time"), plateaus.name)
+        _check_names(names, kind, lambda name, *text: entry["columns"].error(*text))
+        exports = {
+            name: EXPORTS[suffix_of(file)](contents.pop(name), file, column_map.layout) for name, file in files.items()
+        }
+        raw = apply_map(entry, list(exports.values()), column_map)
+        encodings = {name: export.encoding for name, export in exports.items()}
+        del exports
+    drift = NO_DRIFT
+    if "clock" in entry:
+        raw, drift = on_reference(entry["clock"], raw)
+    if "reject" in entry:
+        raw = without_outliers(entry["reject"], raw, _times)
+    if plateaus is not None:
+        raw = readings_of_plateaus(entry["plateaus"], raw, _times(raw), plateaus)
+    raw.rows.flags.writeable = False
+    columns = {column: _to_si(raw, index, kind.columns[column]) for index, column in enumerate(raw.names)}
+    dropped = raw.missing, raw.other, raw.rejected, encodings, drift
+    table = Table(kind.name, label, nodes[0].value, columns, settings, raw.rows, kind.bench, *dropped)
+    return table, replace(raw, columns=()), hashes
+
+
+def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]:
+    """Columns of a file with the settings of new experiments: those of ``kind`` without the reading ``without``.
+
+    Raises
+    ------
+    InputError
+        At a place in the file.
+    """
+    if not path.is_file() or path.suffix.lower() not in READERS:
+        raise InputError("the settings must be a table", "no such table", f"name a file of {' '.join(READERS)}", path)
+    columns = {name: rule for name, rule in kind.columns.items() if name != without}
+    sets = tuple(tuple(name for name in names if name != without) for names in kind.sets)
+    raw = READERS[path.suffix.lower()](path.read_bytes(), path)
+    _check_names(raw.names, replace(kind, columns=columns, sets=sets), partial(raw.error, None))
+    return {name: _to_si(raw, index, columns[name]) for index, name in enumerate(raw.names)}
+
+
+def _file_nodes(entry: Node) -> list[Node]:
+    """The files of an experiment."""
+    if "files" not in entry:
+        if "file" not in entry:
+            raise entry.error("an experiment must have a file", "none", 'add file = "..."')
+        return [entry["file"]]
+    node = entry["files"]
+    if "file" in entry:
+        raise node.error("an experiment has file or files", "both", "remove file", of_key=True)
+    files = isinstance(node.value, list) and bool(node.value)
+    node.require(files, "be a list of files", 'write files = ["...", "..."]')
+    found = [node[index] for index in range(len(node.value))]
+    for each in found:
+        each.text()
+    return found
+
+
+def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTable:
+    """A file with the column names of the kind; an error about its header proposes a column map."""
+    suffix = suffix_of(file)
+    if suffix not in READERS:
+        raise node.error(f"a {suffix} file needs a column map", "no columns", f"add {_proposal(file, kind, Layout())}")
+    try:
+        raw = READERS[suffix](content, file)
+        _check_names(raw.names, kind, partial(raw.error, None))
+    except InputError as error:
+        own = _own_map(TextFile(content, file).line(0), kind)
+        if isinstance(error, MissingCellsError) and own:
+            missing = json.dumps(error.texts, ensure_ascii=False)
+            remedy = (
+                f"add two lines to the experiment, which drop all rows without a reading: {own} and missing = {missing}"
+            )
+        elif error.line != 1 or _A_TRIAL in error.remedy:
+            raise
+        elif own:
+            remedy = f"add to the experiment {own}: other columns are then not read"
+        else:
+            remedy = f"{error.remedy}; or add {_proposal(file, kind, Layout())} to the experiment"
+        raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
+    return raw
+
+
+def _own_map(header: str, kind: KindRule) -> str:
+    """The column map of the headers of a table that the kind itself has; "" where they are not those that it needs."""
+    own = [(found[1], found[0], found[2]) for found in HEADER_CELL.finditer(header)]
+    own = [(name, *rest) for name, *rest in own if name in kind.columns]
+    names = [name for name, *_ in own]
+    try:
+        _check_names(names, kind, lambda name, *text: InputError(*text))
+    except (InputError, IndexError):
+        return ""
+    texts = [f"{name} = {{ from = {json.dumps(header)}, unit = {json.dumps(unit)} }}" for name, header, unit in own]
+    return f"columns = {{ {', '.join(texts)} }}" if len({*names}) == len(names) else ""
+
+
+def _proposal(file: Path, kind: KindRule, layout: Layout) -> str:
+    """The column map that reads a file as ``kind``."""
+    found, first = None, ""
+    with suppress(InputError):
+        found = find_layout(file.read_bytes(), file, sorted({rule.si for rule in kind.columns.values()}))
+        if found.layout.data_from_line != layout.data_from_line is None:
+            first = f"data_from_line = {found.layout.data_from_line} and "
+    return first + proposal(kind, found)
+
+
+def _times(raw: RawTable) -> np.ndarray:
+    """The times of a record, (n,) s, increasing."""
+    return _to_si(raw, raw.names.index("time"), ColumnRule("s", increasing=True)).values
+
+
+def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str, str, str], InputError]) -> None:
+    """Refuse unknown columns, a wrong set of columns, and a table without a channel where the kind has channels.
+
+    ``error`` makes the error about a column from rule, value and remedy.
+    """
+    for name in names:
+        if name not in kind.columns:
+            if name == "time":
+                sets = ", or ".join(" and ".join(columns) for columns in kind.sets)
+                raise error(
+                    name,
+                    f"{kind.name} must be a table of trials",
+                    "a record against time",
+                    f"read {sets} off the record, {_A_TRIAL}, and repeat the trial; plateaus reads steps of one record",
+                )
+            close = closest(name, kind.columns)
+            remedy = f"rename it to {close}" if close else "remove it"
+            known = " ".join(kind.columns)
+            raise error(name, f"unknown column in {kind.name}", shown(name), f"{remedy}; known: {known}")
+    stated = {name for name in names if name not in (*kind.channels, *kind.optional)}
+    if stated not in [set(columns) for columns in kind.sets]:
+        wanted = ", or ".join(" and ".join(columns) for columns in kind.sets)
+        raise error(
+            names[0], f"{kind.name} must have the columns {wanted}", " and ".join(names), "add or remove columns"
+        )
+    if kind.channels and not set(kind.channels).intersection(names):
+        wanted = " ".join(kind.channels)
+        raise error(
+            names[0],
+            f"{kind.name} must have a channel beside {' and '.join(sorted(stated))}",
+            " ".join(names),
+            f"add one of {wanted}",
+        )
+
+
+def _to_si(raw: RawTable, index: int, rule: ColumnRule) -> Column:
+    """Column ``index`` in SI; its values obey ``rule``."""
+    name, unit, written = raw.names[index], raw.units[index], raw.columns[index]
+    try:
+        factor = factor_to_si(unit, rule.si)
+    except UnitError as error:
+        raise raw.error(None, name, f"{name}: {error.rule}", shown(unit), error.remedy) from None
+    with np.errstate(over="ignore"):
+        values = written if factor == 1.0 else scale(written, factor)
+    _check_values(raw, index, rule, values)
+    if rule.varies and np.ptp(values) == 0.0:
+        one = len(values) == 1
+        text = (
+            (f"{name} must vary over the rows", "one row", "add rows")
+            if one
+            else (
+                f"{name} must not be constant",
+                f"{written[0]:g} {unit} in every row",
+                "check the sensor and the export",
+            )
+        )
+        raise raw.error(0 if one else None, name, *text)
+    values.flags.writeable = False
+    return Column(name, unit, 1.0 / factor, values)
+
+
+def _check_values(raw: RawTable, index: int, rule: ColumnRule, values: np.ndarray) -> None:
+    """Refuse a value of column ``index`` outside its domain, or out of order, (n,) SI."""
+    name, unit = raw.names[index], raw.units[index]
+    signed = [c for own, c in zip(raw.names, raw.columns, strict=True) if own != "normal_force"]
+    # Sliding and pulls; a single sign may be a slip of the pen.
+    directed = name in ("speed", "force") and np.sum(values < 0.0) > 1
+    correct = (
+        f"where the sign is the direction, move the rows with {name} < 0 to a file of their own without the minus signs, "
+        'in an experiment of the same kind with direction = "backward"'
+        if directed and all(np.array_equal(np.sign(c), np.sign(values)) for c in signed)
+        else "correct the value or delete the row"
+    )
+    magnitude = f"be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
+    checks: list[tuple[Callable[[], np.ndarray], str, str | None]] = [
+        (lambda: np.isfinite(values) & rule.domain.holds(values), rule.domain.text, correct),
+        (lambda: is_plausible(values), magnitude, "correct the value or the unit of the column"),
+        (lambda: np.diff(values, prepend=-np.inf) > 0.0, "increase from row to row", None),
+    ]
+    for holds, text, remedy in checks[: 2 + rule.increasing]:
+        if not (good := holds()).all():
+            row = int(np.argmin(good))
+            if remedy is None:
+                same = raw.place(row, index)[0] == raw.place(row - 1, index)[0]
+                in_files = "name the files in the order of time, or make an experiment of each"
+                remedy = remedy_of_order(raw, index) if same else in_files
+            raise raw.error(row, name, f"{name} must {text}", f"{raw.columns[index][row]:g} {unit}", remedy)

@@ -8,12 +8,9 @@ A pattern admits only products of known symbols: pint alone reads ``m,s`` as ms 
 import re
 from contextlib import suppress
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-
-if TYPE_CHECKING:
-    import pint
 
 Values = TypeVar("Values", float, np.ndarray)
 
@@ -84,11 +81,11 @@ class UnitError(ValueError):
 
 
 @cache
-def _registry() -> "pint.UnitRegistry":
+def _registry() -> Any:
     """The registry, made when the first unit is read: importing pint takes longer than reading a folder."""
     import pint
 
-    registry = pint.UnitRegistry(None)  # pyright: ignore[reportArgumentType]  (None: an empty registry, by pint's manual)
+    registry: Any = pint.UnitRegistry(None)  # pyright: ignore[reportArgumentType]  (None: an empty one, by pint's manual)
     for symbol, definition in _DEFINITIONS.items():
         registry.define(f"{symbol} = {definition}")
     return registry
@@ -137,7 +134,7 @@ def factor_to_si(unit: str, si: str) -> float:
         raise UnitError(
             f"unit must have the dimension of {si}" if si != "1" else "unit must be 1 (a pure number)", remedy
         )
-    return float(factor)  # pyright: ignore[reportArgumentType]  (pint types every number as Number)
+    return float(factor)
 
 
 def _known(symbol: str) -> str:

@@ -19,8 +19,7 @@ from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report import columns
 from capsule_id.report.columns import table_text
-from capsule_id.report.netcdf import data_tree, netcdf_bytes, read_sample
-from capsule_id.report.write import parameters_json, result_files, write_result
+from capsule_id.report.write import data_tree, netcdf_bytes, parameters_json, read_sample, result_files, write_result
 from capsule_id.views import Finding
 from tests.report.conftest import COLOURED
 

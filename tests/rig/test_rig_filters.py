@@ -146,8 +146,6 @@ def test_window_in_samples() -> None:
         ({"time": np.array([0.0]), "values": np.array([0.0])}, "a filter needs at least 2 samples"),
         ({"window": 7.0}, "the window must fit into the record"),
         ({"order": 5}, "the window must hold more samples than the order"),
-        ({"derivative": 3}, "derivative must lie between 0 and the order"),
-        ({"derivative": -1}, "derivative must lie between 0 and the order"),
     ],
 )
 def test_refused(change: dict, rule: str) -> None:

@@ -78,22 +78,14 @@ def check_stiffness(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding
     """Check that k1 of single records does not depend on amplitude (the paper's "linear near the working point")."""
     if len(records) < 2:
         return []
-    k1, sd, _ = stiffness_by_record(records, fit.values)
+    estimates = [refit(e, e.local(fit.values), [])["k1"] for e in records]
+    k1, sd = (np.array(column) for column in zip(*estimates, strict=True))
     weight = sd**-2.0
     mean = np.average(k1, weights=weight)
     q = float(np.sum(weight * (k1 - mean) ** 2))
     p = float(stats.chi2.sf(q, len(records) - 1))
     facts = {"records": len(records), "low": k1.min(), "high": k1.max(), "chi_square": q, "p": p}
     return [Finding("decays.stiffness", "fail" if p < LEVEL else "ok", facts)]
-
-
-def stiffness_by_record(
-    records: Sequence[DecayRecord], values: Mapping[str, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Estimate k1, its standard error and the largest deflection of every record, (records,) SI."""
-    estimates = [refit(e, e.local(values), [])["k1"] for e in records]
-    k1, sd = (np.array(column) for column in zip(*estimates, strict=True))
-    return k1, sd, np.array([e.largest_deflection for e in records])
 
 
 def check_free_decay(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
@@ -312,17 +304,16 @@ check_zero = each("decays.zero", zero_jumps)
 
 def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
     """Compare k1 and c of every record alone with the paper's protocol."""
-    k1, k1_sd, deflection = stiffness_by_record(records, fit.values)
     rows = []
-    for i, record in enumerate(records):
+    for record in records:
         raw, smooth = record.paper_decrement(smooth=False), record.paper_decrement()
         ours = refit(record, record.local(fit.values), [])
         rows.append(
             {
                 "record": record.label,
-                "largest deflection, m": deflection[i],
-                "k1, N/m": k1[i],
-                "± k1": k1_sd[i],
+                "largest deflection, m": record.largest_deflection,
+                "k1, N/m": ours["k1"][0],
+                "± k1": ours["k1"][1],
                 "c, N s/m": ours["c"][0],
                 "± c": ours["c"][1],
                 "k1 = m1Ω_o²": smooth.k1 if smooth else np.nan,

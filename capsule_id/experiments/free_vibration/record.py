@@ -329,7 +329,6 @@ class DecayRecord(Decay):
     folded: np.ndarray
     step: float
     half_cycles: int = eqx.field(static=True)
-    uniform: bool = eqx.field(static=True)
     #: Order of the time derivative of x_rel that the readings are.
     order: int = eqx.field(static=True)
 
@@ -360,12 +359,11 @@ class DecayRecord(Decay):
         step = uniform_step(self.time)
         linear = self.model == DecayModel(thin=self.model.thin) and self.relative_sd.ndim == 0
         # The sums over an even record have no values at critical damping and beyond.
-        self.uniform = step is not None and linear and bool(self.rough.c < UNIFORM * np.sqrt(self.rough.k1 * self.mass))
-        if self.uniform:
+        uniform = step is not None and linear and self.rough.c < UNIFORM * np.sqrt(self.rough.k1 * self.mass)
+        self.step, self.folded = step or 0.0, fold(self.values) if uniform else np.zeros((0, 0))
+        if uniform:
             # Means of equal blocks of a viscous decay are such a decay, sampled at their middles.
             self.nodes, self.weights = self.time[:, None], np.ones((len(self.time), 1))
-        self.step = step or 0.0
-        self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side = float(np.sign(self.first_turning_point()[1]))
         self.half_cycles = 0 if self.closed else most_half_cycles(float(self.time[-1]), self.rough.Omega_o)
         self.clock_rate = stated_rate(table)
@@ -466,7 +464,7 @@ class DecayRecord(Decay):
         return (Misfit(white[:, 0], 0.0, 1.0, white[:, 1:]),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
-        if not self.uniform or xp is np:
+        if not self.folded.size or xp is np:
             return super().summaries(theta, xp)
         gamma, omega = (rate * stretch(self.clock_rate, theta) for rate in rates(theta["k1"], theta["c"], theta["m1"]))
         yy, ay, aa = decay_moments(self.folded, self.n, self.step, gamma, omega)

@@ -7,7 +7,7 @@ Datasets come from ``motions.sweep`` in SI; ``in_units`` says in what units the 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -199,16 +199,14 @@ def _write_labels(ax: Axes, x: np.ndarray, label: np.ndarray) -> None:
     x, label = x[order], label[order]
     edges = np.concatenate([[x[0]], 0.5 * (x[1:] + x[:-1]), [x[-1]]])
     small: dict[str, Any] = {"fontsize": SMALL - 1.5, "ha": "center", "va": "center", "rotation": 90}
-    begin = 0
-    for name, members in groupby(label):
-        end = begin + len(list(members))
-        left, right = edges[begin], edges[end]
+    begins = [0, *(1 + np.flatnonzero(label[1:] != label[:-1])), len(label)]
+    for begin, end in pairwise(begins):
+        left, right = float(edges[begin]), float(edges[end])
         if begin > 0:
             ax.axvline(left, ymin=0.79, ymax=0.97, color=GREY, lw=0.7)
         if right - left >= _ROOM_FOR_LABEL * (x[-1] - x[0]):
             place = 0.5 * (left + right), 0.88
-            ax.text(*place, str(name), transform=ax.get_xaxis_transform(), parse_math=False, **small)
-        begin = end
+            ax.text(*place, str(label[begin]), transform=ax.get_xaxis_transform(), parse_math=False, **small)
 
 
 def _dots(ax: Axes, x: np.ndarray, y: np.ndarray, **look: object) -> None:

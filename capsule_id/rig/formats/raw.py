@@ -114,11 +114,12 @@ _NOT_WINDOWS = re.compile(rb"[\x81\x8d\x8f\x90\x9d]")
 class TextFile:
     """A text in UTF-8, in UTF-16 with a byte-order mark, or in Windows-1252, compressed where its name ends in ``.gz``.
 
+    ``last`` is the number of the last line that is read, counted from 1 (None: all are read).
+
     Attributes
     ----------
     path : its name, for error lines
     encoding : its encoding
-    last : number of the last line that is read, counted from 1 (None: all are read)
 
     Raises
     ------
@@ -127,7 +128,7 @@ class TextFile:
     """
 
     def __init__(self, content: bytes, path: Path, last: int | None = None) -> None:
-        self.path, self.last = path, last
+        self.path = path
         raw = _bytes_of(content, path)
         self.encoding = _encoding(raw, path)
         text = (
@@ -136,6 +137,9 @@ class TextFile:
             else raw.decode(_CODECS[self.encoding]).encode()
         )
         self._text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
+        if last is not None:
+            ends = np.append(np.flatnonzero(np.frombuffer(self._text, np.uint8) == ord("\n")), len(self._text))
+            self._text = self._text[: ends[min(last, len(ends)) - 1] + 1]
         begin = 0
         while begin + LONGEST_LINE < len(self._text):
             end = self._text.rfind(b"\n", begin, begin + LONGEST_LINE + 1) + 1
@@ -160,11 +164,6 @@ class TextFile:
             block = self._text[begin:end]
             text = block if block.endswith(b"\n") else block + b"\n"
             lines = text.count(b"\n")
-            if self.last is not None and number + lines > self.last:
-                lines = self.last - number
-                text = b"\n".join([*text.split(b"\n", lines)[:-1], b""]) if lines else b""
-            if not lines:
-                return
             if number + lines > first:
                 yield max(number, first), text.split(b"\n", first - number)[-1] if first > number else text
             number += lines
