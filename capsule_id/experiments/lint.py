@@ -23,7 +23,7 @@ from capsule_id.records.tones import frequency_of
 from capsule_id.rig.filters import TIMING_TOLERANCE, hampel_outliers, largest_offset, median_step
 from capsule_id.rig.formats.raw import WINDOWS
 from capsule_id.rig.model import Quantity, Rig, Table
-from capsule_id.rig.schema import RIG_QUANTITIES, ColumnRule, GroundSettings, QuantityRule
+from capsule_id.rig.schema import RIG_QUANTITIES, SHORTEST_RECORD, ColumnRule, GroundSettings, QuantityRule
 from capsule_id.rig.units import factor_to_si
 from capsule_id.views import Finding, Level
 
@@ -323,10 +323,11 @@ def _rounded(table: Table[Any], used: slice, time: float) -> float:
 
 
 def _cut(table: Table[Any], used: slice, key: str, time: float) -> str:
-    """The line that leaves out one side of a time of a decay; a run has no such key."""
+    """The line that leaves out one side of a time of a decay; a run has no such key, and a record has a shortest length."""
     line = f'{key} = {{ value = {_rounded(table, used, time):.10g}, unit = "s" }}'
-    decay = hasattr(table.settings, "stop")
-    return f"Add this line to the experiment in rig.toml: {line}" if decay else "Record again."
+    kept = np.sign(table["time"][used] - time) != (-1.0 if key == "start" else 1.0)
+    possible = hasattr(table.settings, "stop") and np.count_nonzero(kept) >= SHORTEST_RECORD
+    return f"Add this line to the experiment in rig.toml: {line}" if possible else "Record again."
 
 
 def _fault(table: Table[Any], code: str, rows: np.ndarray, level: Level, /, **facts: object) -> Finding:

@@ -192,7 +192,7 @@ FEWEST_CLIPPED, EXCESS = 3, 5.0
 NEIGHBOURS = 5
 #: Readings of at least this part of a limit have its step, where there are so many.
 LARGE_JUMP, FEWEST_LARGE = 0.3, 20
-#: A record held at its limit for longer than this fraction of a period before its release is not clipped.
+#: A record that begins or ends at its limit for longer than this fraction of a period is not clipped there.
 LONGEST_HOLD = 0.2
 
 
@@ -227,9 +227,10 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
         if len(rows) < FEWEST_CLIPPED + EXCESS * (len(near) + _one_sided(near, rows)) / NEIGHBOURS:
             continue  # a smooth peak has as many
         runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-        held = runs[0][0] == 0 and len(runs[0]) > LONGEST_HOLD * period
+        # A hold before the release, or the rest of an overdamped decay.
+        runs = [run for run in runs if len(run) <= LONGEST_HOLD * period or 0 < run[0] <= run[-1] < len(values) - 1]
         # Noise makes single samples equal to the limit by rounding; a clipped peak gives neighbours.
-        runs = [run for run in runs[int(held) :] if len(run) > 1]
+        runs = [run for run in runs if len(run) > 1]
         if sum(map(len, runs)) >= FEWEST_CLIPPED:
             found.append(Clipped(side, limit, np.concatenate(runs)))
     return found

@@ -276,6 +276,19 @@ def test_a_step_after_rest_is_no_clipped_record_and_its_rounding_no_wrong_model(
     assert "readings.clipped" in [f.code for f in again.findings if f.level == "fail"]
 
 
+def test_the_rest_of_an_overdamped_decay_is_not_clipped(tmp_path: Path) -> None:
+    """Steps of 10 um without noise. (Before: clipped at its lower limit, with a start at the last sample as remedy.)"""
+    time, k1, c, m1 = np.arange(1000) / 2000.0, 0.11 * (36.0 * np.pi) ** 2, 2.4 * 0.11 * 36.0 * np.pi, 0.11
+    x = 1e-5 * np.round(2e-3 * viscous(time, k1, c, m1) / 1e-5)
+    rig, kinds = cid.read_rig(folder(tmp_path / "rest", time, x, m1)), default_registry()
+    assert [found.code for found in lint(rig, kinds, rig.tables) if found.level == "fail"] == []
+    # Control: the peak after a blow is clipped, and its rest lies at the other limit.
+    struck = -np.gradient(viscous(time, k1, c, m1))
+    struck = 1e-5 * np.round(2e-3 * np.minimum(struck / np.max(struck), 0.7) / 1e-5)
+    rig = cid.read_rig(folder(tmp_path / "blow", time, struck, m1))
+    assert "readings.clipped" in {found.code for found in lint(rig, kinds, rig.tables)}
+
+
 @pytest.mark.parametrize(
     ("seed", "lost"), [(1, range(90, 110)), pytest.param(3, range(60, 90), marks=pytest.mark.full)]
 )

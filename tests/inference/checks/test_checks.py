@@ -136,7 +136,7 @@ def lines(seed: int, folder: Path) -> list[Line]:
 
 
 def at_truth(line: Line) -> dict[str, float]:
-    scatter = 0.002 * float(np.max(line.y))
+    scatter = 0.002 * float(np.max(line.observed))
     return {line.slope.symbol: TRUTH[line.slope.name], "scatter": scatter, "m1": 0.11, "m2": 0.53, "g": 9.81}
 
 
