@@ -190,9 +190,12 @@ def is_even(time: np.ndarray) -> bool:
 
 
 def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READINGS_PER_PERIOD) -> int:
-    """Samples per block that leave about ``per_period`` readings a period; 1 for a record that does not oscillate."""
+    """Samples per block that leave about ``per_period`` readings a period; 1 for a record that does not oscillate.
+
+    A period that is longer than the record counts as its length, so that some readings are left in any case.
+    """
     try:
-        period = 1.0 / decay_frequency(time, values)
+        period = min(1.0 / decay_frequency(time, values), float(np.ptp(time)))
     except (InputError, ZeroDivisionError):
         return 1
     return max(1, int(period / per_period / median_step(time[loudest_part(values)])))
