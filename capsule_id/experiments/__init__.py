@@ -1,4 +1,4 @@
-"""Experiments: a folder per kind with one declaration; this module handles all experiments of a rig together."""
+"""Experiments: a file or a folder per kind with one declaration; here the experiments of a rig are made."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache

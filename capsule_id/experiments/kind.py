@@ -1,4 +1,4 @@
-"""Declaration of one kind of experiment, its complete interface to the rest of the package, and the registry of all kinds."""
+"""Declaration of one kind of experiment, by which the rest of the package knows it, and the registry of all kinds."""
 
 import os
 import site

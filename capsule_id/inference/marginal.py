@@ -1,4 +1,4 @@
-"""Log-posterior with every scatter integrated out, which the sampler uses."""
+"""Densities of the log-posterior: whole for the point fit, with every scatter integrated out for the sampler."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -428,8 +428,8 @@ def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: 
 
     Returns
     -------
-    Logarithms of: terms without scatters (w, blocks); densities of t at the nodes (w, scatters, nodes), see
-    ``capsule_id.inference.marginal``; their integrals (w, scatters).
+    Logarithms of: terms without scatters (w, blocks); densities of t at the nodes (w, scatters, nodes);
+    their integrals (w, scatters).
     """
     of_row = partial(_conditional, layout, target, bend)
     if target.work < HEAVY:

@@ -180,7 +180,7 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
     centre = target.unconstrain(np.array([start.centre for start in proposed]))
     spread = np.array([start.spread for start in proposed])
     z = np.random.default_rng(seed).standard_normal((number, target.dimension))
-    # The first start is the paper's estimate. The others differ from it by at least a third of their spread.
+    # The first start is the centre. The others differ from it by at least a third of their spread.
     z = np.where(np.abs(z) < 1.0 / 3.0, np.copysign(1.0 / 3.0, z), z)
     z[0] = 0.0
     return centre + spread * z

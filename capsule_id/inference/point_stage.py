@@ -64,7 +64,7 @@ def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
     return -float(best.fun), target.mapping(target.theta(u))
 
 
-# sampled fit: Data of a finished fit that checks and tables read.
+# sampled fit: What checks and tables read of a fit.
 
 
 #: Largest factor of an sd beside which the fit still gives a number.
@@ -103,7 +103,7 @@ class SampledFit:
 
     ``target`` holds the experiments as fitted, with divided records.
 
-    See ``capsule_id.experiments.base.Fitted``.
+    Checks and tables of experiments read it as ``capsule_id.experiments.context.Fitted``.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Sample of the posterior: independent ensembles until convergence, and emulation of slow motions."""
+"""Sample of the posterior: independent ensembles until convergence or the budget, and emulation of slow motions."""
 
 import os
 import time

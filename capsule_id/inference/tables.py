@@ -1,4 +1,4 @@
-"""Tables of a fit: parameters, notes on them, notes on runs."""
+"""Tables of a fit: parameters, notes on them, notes on runs, and the check of the engine."""
 
 from collections.abc import Mapping
 from typing import Any, Literal

@@ -1,4 +1,4 @@
-"""Joint log-posterior of all experiments in an unconstrained space."""
+"""What a log-posterior is made of: experiments, priors, coordinates u, residuals; ``marginal`` computes its densities."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field

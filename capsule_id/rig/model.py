@@ -103,7 +103,7 @@ class Table(Generic[S]):
     Attributes
     ----------
     kind : name of its kind, as in ``rig.toml``
-    label : unique within the rig, the file's name without suffix
+    label : unique within the rig: as stated, else the file's name without suffix
     file : path relative to the folder, of the first file
     columns : by name
     settings : of its kind, checked, defaults filled in

@@ -1,4 +1,4 @@
-"""All checks of a fit, the error of its model, and which of its numbers may be quoted."""
+"""The checks of a fit that need no second fit, the error of its model, and which of its numbers may be quoted."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -142,7 +142,7 @@ INFORMED_RATIO = 0.9
 
 
 def run_checks(sampled: SampledFit) -> SampledFit:
-    """Run all checks: return ``sampled`` with all findings and flagged outliers."""
+    """Run the checks of a fit: return ``sampled`` with their findings and flagged outliers; ``check_fit`` adds the others."""
     whiteness = check_whiteness(sampled)
     outliers, flagged = check_outliers(sampled)
     sampled = replace(sampled, flagged=flagged)
