@@ -1,4 +1,4 @@
-"""Free vibration of the rod in a capsule at rest (paper, section 2.2): k1 and c, their checks and tables."""
+"""Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c, their checks and tables."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
