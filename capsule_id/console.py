@@ -72,7 +72,7 @@ def threads(number: int) -> Iterator[ThreadPoolExecutor]:
 
 @contextmanager
 def interruptible(message: str) -> Iterator[None]:
-    """SIGINT and SIGTERM set the flag of ``stop_if_interrupted``; after ``GRACE`` seconds they end the process.
+    """In the block SIGINT and SIGTERM set the flag of ``stop_if_interrupted``; ``GRACE`` seconds later the process ends.
 
     Signals that the process ignores stay ignored. Outside the main thread the block changes nothing.
 

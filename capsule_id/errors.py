@@ -1,4 +1,4 @@
-"""The exceptions for bad input and for output without space; they name place, reason and remedy."""
+"""The exceptions for bad input and for output that cannot be written; they name place, reason and remedy."""
 
 import errno
 import json

@@ -1,4 +1,5 @@
-"""The parameter table: symbol, unit, meaning, LaTeX label, default prior, sign, and leaf of the model.
+"""The parameter table: symbol, unit, meaning, LaTeX label, default prior, sign, and which field of the capsule or
+of a drive it is.
 
 Priors, engines, command options, sweeps, axes, report and guide read it. A kind of experiment declares parameters of
 its own (``capsule_id.experiments``). The *name* of a parameter is its symbol; a bracket names the spring or record, as

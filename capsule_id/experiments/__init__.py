@@ -41,7 +41,7 @@ def make_experiments(
     registry: Registry | None = None,
     friction: "type[FrictionLaw] | None" = None,
 ) -> tuple["Experiment", ...]:
-    """Make the rig's experiments, in the order of ``rig.toml``.
+    """Make the selected experiments of the rig, in the order of ``rig.toml``.
 
     Parameters
     ----------

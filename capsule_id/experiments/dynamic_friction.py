@@ -170,7 +170,7 @@ class Track(NamedTuple):
     along: Any
 
     def braking(self, friction: Any) -> Any:
-        """What brakes a slide, per normal force, from its coefficient of friction, 1."""
+        """Braking force over the normal force, 1: the coefficient of ``friction`` and the weight along the slope."""
         return array_module(friction).maximum(friction + self.along / self.normal, LEAST_BRAKING * friction)
 
     def distance(self, law: FrictionLaw, speed: Any) -> Any:

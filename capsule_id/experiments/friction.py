@@ -111,8 +111,8 @@ MESSAGES = {
     "friction.variants": Message(
         "friction law",
         ok=(
-            "{name} explains the readings as well as the best of {count} friction laws, which is {factor:.2g} times as "
-            "probable. The simplest law that does so is {simplest}: {line} in [model]"
+            "the readings do not reject {name}: the best of {count} friction laws is {factor:.2g} times as probable. The "
+            "simplest law that they do not tell from the best is {simplest}: {line} in [model]"
         ),
         fail=(
             "{labels}: expected readings that {name} explains; found them {factor:.3g} times more probable under another "

@@ -140,7 +140,7 @@ def lint_magnitudes(tables: Sequence[Table[Any]], kinds: Mapping[str, Kind], rig
 
 
 def lint_stated_sd(table: Table[Any], kind: Kind) -> Iterable[Finding]:
-    """Warn of amplitudes, lags and gaps whose normal prior reaches below 0; a slope and N0 may be 0."""
+    """Warn of amplitudes, lags and gaps that lie less than 2 sd from 0; a slope and N0 may be 0."""
     for key in kind.setting_rules.keys() - GroundSettings.__dataclass_fields__.keys():
         stated = getattr(table.settings, key)
         if isinstance(stated, Quantity) and 0.0 < abs(stated.value) < 2.0 * stated.sd:

@@ -1,8 +1,8 @@
-"""One form of every test with a row per trial: a reading, and what the parameters and the other columns predict for it.
+"""Common form of lines and friction tests: a row per trial, its reading, and what parameters and other columns predict.
 
-The built-in kinds with a row per trial have this form, calibration lines and friction tests alike: linear nuisances and
-the scatter are integrated out, and errors of the other columns are carried over to the reading to first order. Lines
-add a prior along the line, and friction tests share a panel. A kind of another package needs little more than ``predict``.
+Linear nuisances and the scatter are integrated out, and errors of the other columns are carried over to the reading
+to first order. Lines add a prior along the line, and friction tests share a panel. A kind of another package needs
+little more than ``predict``.
 """
 
 from abc import abstractmethod

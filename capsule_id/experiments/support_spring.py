@@ -81,8 +81,8 @@ CANTILEVER = Message(
         "stated lengths; k2 of each spring stays a parameter of its own."
     ),
     fail=(
-        "a longer cantilever must be softer, but {longest} is stiffer than {shortest}: k2 ~ L^({exponent:.3f} ± {sd:.3f}), "
-        "{p:p} for the -3 of a cantilever. Check whether the files or the lengths of these two are exchanged."
+        "k2 must fall with the length, as L^-3, but it rises from {shortest} to {longest}: k2 ~ L^({exponent:.3f} ± {sd:.3f}), "
+        "{p:p} for the exponent -3. Check whether files or lengths are exchanged."
     ),
 )
 

@@ -327,7 +327,7 @@ def _exact(model: Any, blocks: Sequence[np.ndarray]) -> Parts:
 
 
 def _parts(blobs: Any, blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """(w, blocks, k) from the form in which emcee stores it."""
+    """Log-density of each block, and what else is kept of it, from emcee's blobs; (w, blocks, k)."""
     return np.reshape(blobs, (len(blobs), len(blocks), -1))
 
 

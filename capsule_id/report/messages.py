@@ -244,7 +244,7 @@ DATA_MESSAGES: Mapping[str, Message] = {
     "decays.magnitude": Message("magnitudes", warn=_unusual, on_console=True),
     "settings.sd": Message(
         "stated sd",
-        warn="{name} is {value:.4g} ± {sd:.4g} in SI units: its prior reaches below 0. State the sd of a measurement.",
+        warn="{name} is {value:.4g} ± {sd:.4g} in SI units: 0 is less than 2 sd away. State the sd of a measurement.",
     ),
     "readings.gaps": Message(
         "gaps in a record",
@@ -255,7 +255,7 @@ DATA_MESSAGES: Mapping[str, Message] = {
     ),
     "readings.rounded_times": Message(
         "rounded times",
-        warn="{file}: the times are rounded to {step:g} s, a large part of a sampling step. Export more digits.",
+        warn="{file}: the times are rounded to {step:g} s, which is 2 % of a sampling step or more. Export more digits.",
     ),
     "readings.clipped": Message(
         "clipped samples",
@@ -529,7 +529,7 @@ FIT_MESSAGES: Mapping[str, Message] = {
     "parameters.informed": Message(
         "parameters informed",
         ok="the data narrow the prior of every physical parameter",
-        warn="the data hardly narrow the prior of {names}: the printed interval is that of the prior. Add a test.",
+        warn="the data reduce the prior sd of {names} by less than 10 %: the interval is mostly that of the prior. Add a test.",
     ),
     "priors.conflict": Message(
         "priors and data", ok="priors and weighings, {number} in all, agree with the rest of the data", fail=_conflict

@@ -113,7 +113,10 @@ LARGEST_INNER_STEP, LEAST_SHARE = 0.3, 0.1
 
 @dataclass(frozen=True)
 class Plateaus:
-    """Levels of the column ``name`` in the order of time, in ``unit``; ``guard``: left out beside each step, s."""
+    """Stated levels of the column ``name``, in the order of time and in ``unit``.
+
+    ``guard`` is left out before and after each step, s.
+    """
 
     name: str
     levels: np.ndarray

@@ -45,7 +45,7 @@ def test_exchanged_files_fail_and_are_named() -> None:
     assert finding.level == "fail"
     assert finding.parameters == ("k2[L50]", "k2[L75]")
     text = finding_text(finding, messages_of(default_registry()))
-    assert "spring_75 is stiffer than spring_50" in text
+    assert "it rises from spring_50 to spring_75" in text
     assert "exchanged" in text
 
 

@@ -154,12 +154,10 @@ def test_at_most_1_percent_of_wrong_units_are_missed(tmp_path: Path) -> None:
 def with_asked_lines(rig: Rig) -> Rig:
     """The rig with the line that confirms its scales, and the prior of k1 that excludes the alias of even samples."""
     confirmed = [name for finding in scales(rig) for name in line_of(finding)]
-    asked = [found.facts["other"] for found in lint(rig, KINDS, rig.tables) if found.code == "decays.sampling"]
-    priors = {
-        "k1": Prior("lognormal", *map(float, re.findall(r"k1 = { median = ([0-9.e+]+), factor = ([0-9.]+),", text)[0]))
-        for text in filter(None, asked)
-    }
-    return replace(rig, confirmed=tuple(confirmed), priors={**rig.priors, **priors})
+    asked = "".join(found.facts["other"] for found in lint(rig, KINDS, rig.tables) if found.code == "decays.sampling")
+    stated = re.findall(r"k1 = { median = ([0-9.e+]+), factor = ([0-9.]+),", asked)[:1]
+    priors = [("k1", Prior("lognormal", float(median), float(factor))) for median, factor in stated]
+    return replace(rig, confirmed=tuple(confirmed), priors={**rig.priors, **dict(priors)})
 
 
 @pytest.mark.slow
@@ -274,7 +272,7 @@ def test_an_amplitude_or_gap_whose_prior_reaches_below_0_is_named() -> None:
 
     assert named() == []
     assert named(P_d=Quantity(4.0, 3.0)) == [
-        "run: P_d is 4 ± 3 in SI units: its prior reaches below 0. State the sd of a measurement."
+        "run: P_d is 4 ± 3 in SI units: 0 is less than 2 sd away. State the sd of a measurement."
     ]
     assert "gap is 0.001 ± 0.0008" in named(gap=Quantity(1e-3, 8e-4))[0]
     assert named(gap=Quantity(0.0, 2e-5)) == []

@@ -485,7 +485,7 @@ MESSAGES = {
         "Nondimensional groups",
         caption=(
             "A prototype of another size with equal groups has an equal motion. Omega0 = √(k1/m1), zeta = c/(2 m1 Omega0), "
-            "F_b: break-away force, mu (m1 + m2) g by eq. (1). A shared group is listed once."
+            "F_b: break-away force, by eq. (1) on level ground mu (m1 + m2) g. A shared group is listed once."
         ),
     ),
     "runs.motion": Message(

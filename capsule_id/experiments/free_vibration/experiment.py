@@ -139,13 +139,15 @@ def changes_of_second_half(e: DecayRecord, theta: ValuesBySymbol) -> dict[str, t
 
 
 def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
-    """State the lowest alias of the records with even samples, which cannot exclude it."""
+    """State the lowest alias of the records with even samples, and which of them have it."""
     found = ((e.label, *sampling(decay_window(e.table)[0])) for e in records)
     rates = {label: rate for label, rate, even in found if even}
     if not rates or "m1" not in fit.values:
         return []
-    k1 = (2.0 * np.pi * min(rates.values()) * np.sqrt(fit.values["m1"]) - np.sqrt(fit.values["k1"])) ** 2
-    facts = {"labels": ", ".join(rates), "other": float(np.sqrt(k1 / fit.values["m1"])) / (2.0 * np.pi), "k1": k1}
+    lowest = min(rates.values())
+    k1 = (2.0 * np.pi * lowest * np.sqrt(fit.values["m1"]) - np.sqrt(fit.values["k1"])) ** 2
+    labels = (label for label, rate in rates.items() if np.isclose(rate, lowest))
+    facts = {"labels": ", ".join(labels), "other": float(np.sqrt(k1 / fit.values["m1"])) / (2.0 * np.pi), "k1": k1}
     return [Finding("decays.alias", "ok", facts)]
 
 
@@ -168,7 +170,7 @@ def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Find
 
 
 def drift(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
-    """Judge whether a Gaussian-process drift is slow: its part at the frequency of the decay hides errors of the model."""
+    """Judge whether a Gaussian-process drift is slower and smaller than the motion, else it hides errors of the model."""
     if e.model.drift != "gp":
         return None
     half = np.pi * np.sqrt(theta["m1"] / theta["k1"])

@@ -336,8 +336,8 @@ LINT_MESSAGES = {
     "decays.alias": Message(
         "aliasing",
         ok=(
-            "{labels}: even samples cannot exclude an alias. {other:.4g} Hz (k1 = {k1:.4g} N/m) has the same samples; it "
-            "must lie outside what is known of k1"
+            "{labels}: samples at equal intervals do not exclude a second frequency, {other:.4g} Hz (k1 = {k1:.4g} N/m). Make "
+            "sure that k1 cannot have this value"
         ),
         warn=partial(_alias, _OUTSIDE),
         fail=partial(_alias, _ALIAS),
@@ -472,7 +472,7 @@ MESSAGES = {
         ok="k1 is the same in all {records} records ({p:p})",
         fail=(
             "expected one k1 for all releases (linear near the working point); the {records} records give {low:.5g} to "
-            "{high:.5g} N/m (chi-square {chi_square:.1f}, {p:p}). Release from smaller deflections, or use k1 at this "
+            "{high:.5g} N/m (chi-square {chi_square:.1f}, {p:p}). Release from smaller deflections, or fit records of one "
             "amplitude only."
         ),
     ),
@@ -549,9 +549,9 @@ MESSAGES = {
         ok="{labels}: no jump of the sensor's zero stands out where the rod turns",
         fail=(
             "{label}: the zero of the sensor must stay the same, but it jumps where the rod turns; the rms change from a half "
-            "swing to the next is {jump:.2g} {unit}. With one zero per half swing ({half_swings}), the squared residuals are "
-            "{ratio:.0%} of those with a zero that changes slowly. A loose sensor can cause this, or an encoder that loses "
-            "counts. No fit corrects it. Fasten the sensor or replace it, and record again."
+            "swing to the next is {jump:.2g} {unit}. A zero that jumps at each turn ({half_swings:# half swing}) leaves "
+            "{ratio:.0%} of the squared residuals that a continuous zero leaves. A loose sensor can cause this, or an "
+            "encoder that loses counts. No fit corrects it. Fasten the sensor or replace it, and record again."
         ),
     ),
     "decays.halves": Message(
@@ -580,8 +580,8 @@ MESSAGES = {
         warn=_second_fit,
         caption=(
             "Free decays alone, under the stated model and under the model of the quoted values, both by maximum likelihood on "
-            "the readings of the latter; records weighted by their errors. BIC is relative to the lower one. Lines of rig.toml "
-            "that state the quoted model: {lines}."
+            "the readings of the latter; records weighted by their errors. BIC: difference from the lower one of both. "
+            "Lines of rig.toml that state the quoted model: {lines}."
         ),
     ),
 }

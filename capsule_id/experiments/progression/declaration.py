@@ -77,9 +77,10 @@ FEWEST_SETTINGS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressionSettings(GroundSettings):
-    """Settings of a progression, SI. ``P_on``, ``P_d`` and ``lag`` are priors where they have an sd.
+    """Settings of a progression, SI.
 
-    With heavy ``tails`` a trial may be outlying, see ``capsule_id.experiments.progression.declaration``.
+    ``P_on``, ``P_d`` and ``lag`` with an sd are fitted, with value and sd as prior; without an sd they are fixed.
+    With heavy ``tails`` a trial may be outlying.
     """
 
     drive: Literal["pulses", "harmonic"] = "pulses"
@@ -202,8 +203,8 @@ MESSAGES = {
     "progression.sessions": Message(
         "sessions",
         warn="{several:# session} with several settings, and only {most} of them have their friction as a parameter. The "
-        "others count as a new session at every setting, so that intervals are too narrow: give the table of each day "
-        "or place its own entry",
+        "fit takes each of the others for a new session at every setting, so that intervals are too narrow: write one "
+        "table and one entry for each day or location",
         caption=(
             "Sessions with several settings: the parameter of each one, its number in the file, how many settings and trials "
             "it has, and its friction relative to that of an average session."
