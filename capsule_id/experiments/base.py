@@ -188,7 +188,7 @@ class Experiment(eqx.Module):
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         """Misfits for the likelihood alone: moments where they are sufficient."""
-        return tuple(misfit.summary() for misfit in self.misfits(theta, xp))
+        return tuple(misfit.summary(xp) for misfit in self.misfits(theta, xp))
 
     def misfit(self, theta: ValuesBySymbol) -> ScaledMisfit:
         """Misfit of all groups together at the scatters of ``theta``, NumPy."""

@@ -234,8 +234,8 @@ class DynamicFriction(FrictionExperiment):
         speed = self.readings["speed"]
         return speed, self.track(self.stated).coefficient(speed, self.observed)
 
-    def paper_coefficient(self, law: FrictionLaw) -> Any:
-        speed, track = self.readings["speed"], self.track(self.stated)
+    def paper_coefficient(self, law: FrictionLaw, speed: np.ndarray) -> Any:
+        track = self.track(self.stated)
         return track.coefficient(speed, track.distance(law, speed))
 
     def point_errors(self) -> tuple[np.ndarray, float]:

@@ -343,9 +343,9 @@ class FrictionExperiment(PointTest):
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Speed, m/s, and friction coefficient by the paper's formulas, (n,) each."""
 
-    def paper_coefficient(self, law: FrictionLaw) -> Any:
-        """The paper's coefficients (..., n) where ``law``, with leaves (..., 1, 1), is the friction coefficient."""
-        return law.forward(self.paper_points()[0][:, None])[..., 0]
+    def paper_coefficient(self, law: FrictionLaw, speed: np.ndarray) -> Any:
+        """The paper's coefficients (..., n) at ``speed`` (n,), m/s, where ``law``, leaves (..., 1, 1), is the coefficient."""
+        return law.forward(speed[:, None])[..., 0]
 
     def starts(self) -> dict[str, Start]:
         """Starts of mu and v_s from the paper's estimates; another law starts at its prior medians."""

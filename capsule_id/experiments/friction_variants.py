@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -26,7 +26,9 @@ from capsule_id.views import Finding
 
 #: Ratio of marginal likelihoods above which a variant is rejected, and above which data tell it from the best.
 FACTOR, TELLING = 100.0, 10.0
-#: Coefficients, particles times readings, that are predicted at a time: memory grows with neither.
+#: Number of groups of readings, neighbours in speed: time and memory do not grow with the readings beyond.
+GROUPS = 128
+#: Coefficients, particles times groups, that are predicted at a time: memory does not grow with the particles.
 MOST_AT_ONCE = 1 << 16
 #: Number of particles, Metropolis steps between two powers, and the part of the particles that a power must keep.
 PARTICLES, MOVES, KEPT = 1000, 6, 0.5
@@ -76,15 +78,49 @@ def candidates(experiments: Sequence[Any]) -> list[FrictionModel]:
     return sorted({in_use, *models}, key=lambda m: (len(m.parameters), not m.constant, m.free))
 
 
+class Groups(NamedTuple):
+    """Readings of one experiment in groups of neighbours in speed, (g,) each; a short table has a group for every reading.
+
+    speed, logs : means of the paper's points, m/s and logarithms of the coefficients
+    reading, per_scatter : relative sd of a point from the reading errors, and per unit of the scatter
+    number, spread : readings, and the sum of squares of their logarithms about the curve, from neighbours' differences
+    """
+
+    speed: np.ndarray
+    logs: np.ndarray
+    reading: np.ndarray
+    per_scatter: np.ndarray
+    number: np.ndarray
+    spread: np.ndarray
+
+
+def _grouped(e: Any, most: int) -> Groups:
+    """The points of a friction experiment in ``most`` groups at most."""
+    speed, coefficient = e.paper_points()
+    order = np.argsort(speed, kind="stable") if e.n > most else np.arange(e.n)
+    first = np.unique(np.linspace(0, e.n, min(e.n, most), endpoint=False).astype(int))
+    number, logs = np.diff(np.append(first, e.n)), np.log(coefficient)[order]
+    step = np.diff(logs, prepend=0.0)
+    step[first] = 0.0
+
+    def mean(x: Any) -> np.ndarray:
+        return np.add.reduceat(np.broadcast_to(x, e.n)[order], first) / number
+
+    errors = (np.sqrt(mean(np.square(x))) for x in e.point_errors())
+    logs = np.add.reduceat(logs, first) / number
+    return Groups(mean(speed), logs, *errors, number, np.add.reduceat(0.5 * step**2, first))
+
+
 class VariantPoints:
     """The paper's points of all friction experiments, and their density under a law."""
 
     def __init__(self, experiments: Sequence[Any]) -> None:
         self.experiments = tuple(experiments)
-        points = [e.paper_points() for e in experiments]
-        self.speed = np.concatenate([speed for speed, _ in points])
-        self.logs = [np.log(coefficient) for _, coefficient in points]
-        self.errors = [e.point_errors() for e in experiments]
+        self.n = sum(e.n for e in experiments)
+        self.parts = [_grouped(e, -(-GROUPS * e.n // self.n)) for e in experiments]
+        self.speed, self.number, self.spread = (
+            np.concatenate([getattr(part, name) for part in self.parts]) for name in ("speed", "number", "spread")
+        )
         rig = experiments[0].rig
         weighed = rig.m1 is not None and rig.m2 is not None
         self.normal_forces = [e.stated_normal_force if weighed else np.nan for e in experiments]
@@ -97,20 +133,18 @@ class VariantPoints:
         return [row.named(row.of, stated.get(row.name)) for row in rows]
 
     def scaled(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Differences of log-coefficients and their sd, (s, n) each, at ``theta``: (s,) by symbol."""
+        """Differences of the groups' log-coefficients, and the sd of a reading, (s, g) each, at ``theta``: (s,) by symbol."""
         known = {row.symbol: theta[row.symbol] for row in model.parameters} | (CONSTANT if model.constant else {})
         viscous = known.pop("viscous", None)
         raw, sd = [], []
-        for e, logs, (reading, per_scatter), N in zip(
-            self.experiments, self.logs, self.errors, self.normal_forces, strict=True
-        ):
+        for e, part, N in zip(self.experiments, self.parts, self.normal_forces, strict=True):
             own = {**known, "viscous": 0.0 if viscous is None else viscous / N}
             leaves = {name: value if np.ndim(value) == 0 else value[:, None, None] for name, value in own.items()}
             law = CoulombStribeck(N=1.0, **leaves)
             law = Reversed(law) if e.friction.direction == "backward" else law
-            scatter = theta[e.scatter.symbol][:, None] * per_scatter
-            raw.append(logs - np.log(e.paper_coefficient(law)))
-            sd.append(np.sqrt(reading**2 + scatter**2 + SMALLEST_ERROR**2) * np.ones(len(logs)))
+            scatter = theta[e.scatter.symbol][:, None] * part.per_scatter
+            raw.append(part.logs - np.log(e.paper_coefficient(law, part.speed)))
+            sd.append(np.sqrt(part.reading**2 + scatter**2 + SMALLEST_ERROR**2))
         return np.concatenate(raw, axis=1), np.concatenate(sd, axis=1)
 
     def log_likelihood(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -119,7 +153,8 @@ class VariantPoints:
         values = []
         for first in range(0, number, step):
             raw, sd = self.scaled(model, {name: column[first : first + step] for name, column in theta.items()})
-            values.append(-0.5 * np.sum((raw / sd) ** 2 + LOG_2PI + 2.0 * np.log(sd), axis=1))
+            squares = self.number * (raw / sd) ** 2 + self.spread / sd**2
+            values.append(-0.5 * np.sum(squares + self.number * (LOG_2PI + 2.0 * np.log(sd)), axis=1))
         value = np.concatenate(values)
         return np.where(np.isfinite(value), value, -np.inf)
 
@@ -147,8 +182,8 @@ def fit_variant(points: VariantPoints, model: FrictionModel, seed: int, particle
         {name: float(np.std(column)) for name, column in own.items()},
         float(values[best]),
         evidence,
-        len(rows) * float(np.log(len(points.speed))) - 2.0 * float(values[best]),
-        order_p((raw / sd)[0][order], np.random.default_rng(seed)),
+        len(rows) * float(np.log(points.n)) - 2.0 * float(values[best]),
+        order_p((np.sqrt(points.number) * raw / sd)[0][order], np.random.default_rng(seed)),
     )
 
 

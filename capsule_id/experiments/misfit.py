@@ -18,6 +18,9 @@ import numpy as np
 NUISANCE_WIDTH = 10.0
 #: From this number of nuisances on they are eliminated in a loop, not step by step.
 MANY_NUISANCES = 8
+#: Largest number of readings that are summed one by one at every scatter; variances that stand for those of more readings;
+#: smallest ratio of two of them.
+MANY_READINGS, VARIANCES, LEAST_RATIO = 256, 24, 1e-8
 #: log(2 pi), from the normalisation of a normal density.
 LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -151,13 +154,16 @@ class ScaledMisfit:
 
 @dataclass(frozen=True)
 class Moments:
-    """Sufficient moments of readings with one common variance, ``fixed_variance + (scale scatter)^2``.
+    """Sufficient moments of readings of g variances, ``fixed_variance + (scale scatter)^2``; () for (g,) where g is 1.
 
     Attributes
     ----------
-    yy, ay, aa : (), (p,), (p, p) y'y, A'y, A'A, not divided by the noise
+    yy, ay, aa : (g,), (g, p), (g, p, p) y'y, A'y, A'A, not divided by the noise
     n : number of readings
+    fixed_variance, share : (g,); the part of the readings that has each variance
+    scale : ()
     ordinate : () and (), see ``Misfit``
+    log_scale : sum of the logarithms of the units that the readings were divided by
     """
 
     yy: Any
@@ -167,16 +173,21 @@ class Moments:
     fixed_variance: Any
     scale: Any = 1.0
     ordinate: tuple[Any, Any] | None = None
+    share: Any = 1.0
+    log_scale: Any = 0.0
 
     def log_density(self, scatter: Any, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings at ``scatter`` (...), nuisances integrated out; (...)."""
-        scatter = xp.asarray(scatter)
-        v = _variance(self.fixed_variance, self.scale, scatter)
+        scatter, p = xp.asarray(scatter)[..., None], self.ay.shape[-1]
+
+        def wide(x: Any, *own: int) -> Any:
+            return xp.reshape(x, (*(1,) * (scatter.ndim - 1), np.size(self.fixed_variance), *own))
+
+        v = _variance(wide(self.fixed_variance), self.scale, scatter)
         own = v if self.ordinate is None else _variance(*self.ordinate, scatter)
-        leading = (1,) * scatter.ndim
-        ay = xp.broadcast_to(self.ay, (*leading, *self.ay.shape)) / v[..., None]
-        aa = xp.broadcast_to(self.aa, (*leading, *self.aa.shape)) / v[..., None, None]
-        return marginal_log_density(self.yy / v, ay, aa, self.n, xp) - 0.5 * self.n * xp.log(own)
+        ay, aa = (wide(self.ay, p) / v[..., None]).sum(-2), (wide(self.aa, p, p) / v[..., None, None]).sum(-3)
+        measure = self.n * (wide(self.share) * xp.log(own)).sum(-1)
+        return marginal_log_density((wide(self.yy) / v).sum(-1), ay, aa, self.n, xp) - 0.5 * measure - self.log_scale
 
 
 @dataclass(frozen=True)
@@ -213,13 +224,32 @@ class Misfit:
             own = _variance(wide(self.ordinate[0]), wide(self.ordinate[1]), scatter)
         return ScaledMisfit(wide(self.raw), xp.sqrt(variance), self.design, 0.5 * xp.log(variance / own))
 
-    def summary(self) -> "Misfit | Moments":
-        """Return the moments where all readings have one variance, else the misfit."""
-        numbers = (self.fixed_variance, self.scale, *(self.ordinate or ()))
-        if any(np.ndim(number) for number in numbers):
-            return self
-        y, a = self.raw, self.design
-        return Moments(y @ y, a.T @ y, a.T @ a, y.shape[0], self.fixed_variance, self.scale, self.ordinate)
+    def summary(self, xp: ModuleType = jnp) -> "Misfit | Moments":
+        """Return the moments where all readings have one variance, or there are many; else the misfit."""
+        y, a, numbers = self.raw, self.design, (self.fixed_variance, self.scale, *(self.ordinate or ()))
+        if not any(np.ndim(number) for number in numbers):
+            return Moments(y @ y, a.T @ y, a.T @ a, y.shape[0], self.fixed_variance, self.scale, self.ordinate)
+        return self if y.shape[0] <= MANY_READINGS or self.ordinate is not None else self._interpolated(xp)
+
+    def _interpolated(self, xp: ModuleType) -> Moments:
+        """Moments at Chebyshev nodes in the logarithm of r = fixed_variance/scale^2: what is summed over the readings,
+        log(r + scatter^2) and 1/(r + scatter^2), is smooth in it, whatever the scatter.
+        """
+        n = self.raw.shape[0]
+        unit = xp.broadcast_to(self.scale, (n,))
+        r = self.fixed_variance / unit**2
+        r = xp.log(xp.maximum(r, LEAST_RATIO * xp.max(r) + np.finfo(float).tiny))
+        middle, half = 0.5 * (xp.max(r) + xp.min(r)), 0.5 * (xp.max(r) - xp.min(r))
+        x, y, a = (r - middle) / xp.where(half > 0.0, half, 1.0), self.raw / unit, self.design / unit[:, None]
+        angle = np.pi * (np.arange(VARIANCES) + 0.5) / VARIANCES
+        sums, before, now = [], x, xp.ones(n)
+        for _ in angle:
+            sums.append((xp.sum(now), y @ (now * y), a.T @ (now * y), a.T @ (now[:, None] * a)))
+            before, now = now, 2.0 * x * now - before
+        at_nodes = np.cos(np.arange(VARIANCES) * angle[:, None]) * np.where(np.arange(VARIANCES), 2.0, 1.0) / VARIANCES
+        number, yy, ay, aa = (xp.tensordot(at_nodes, xp.stack(parts), 1) for parts in zip(*sums, strict=True))
+        variances = xp.exp(middle + half * np.cos(angle))
+        return Moments(yy, ay, aa, n, variances, 1.0, None, number / n, xp.sum(xp.log(unit)))
 
     def log_density(self, scatter: Any, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings at ``scatter`` (...), nuisances integrated out; (...)."""

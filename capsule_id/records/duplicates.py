@@ -79,7 +79,7 @@ def reading_step(values: np.ndarray) -> float:
             return spacing
     first = -int(np.floor(np.log10(scale)))
     rounded = ((k, np.round(values, k), 1e-9 * 10.0**-k) for k in range(first, first + MOST_DECIMALS))
-    fits = (k for k, own, error in rounded if np.allclose(own, values, rtol=0.0, atol=error + 4e-16 * scale))
+    fits = (k for k, own, error in rounded if np.max(np.abs(own - values)) <= error + 4e-16 * scale)
     return next((10.0**-k for k in fits), 0.0)
 
 

@@ -236,7 +236,9 @@ class ViscousFit(NamedTuple):
         return Decrement(np.array([time]), np.array([peak]), self.omega, delta, m1 * self.square, 2.0 * m1 * self.gamma)
 
 
-def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: int = 0) -> ViscousFit:
+def viscous_fit(
+    time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: int = 0, rough: float = 0.0
+) -> ViscousFit:
     """Fit a viscous decay of any damping to a record of displacements, velocities or accelerations.
 
     Its motions and the offset are linear. Frequency and damping ratio are searched on a grid, and about the highest peak
@@ -248,6 +250,7 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: 
     unknowns : that are searched. 2: a decay. 1: one exponential, which a far overdamped decay leaves of its motion. 3: a
         single stroke, after which dry friction holds the rod; the time of its stop is searched too
     order : of the derivative of x_rel that a stroke is fitted to
+    rough : damping ratio of the grid below which its best point is not refined
     """
     time, size = time - time[0], float(np.std(values)) or 1.0
     rest = np.mean(values[-max(len(values) // 5, 4) :])
@@ -288,6 +291,8 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: 
     ridge = SINGULAR * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(square.shape[1])
     taken = np.sum(product * np.linalg.solve(square + ridge, product[..., None])[..., 0], axis=1)
     starts = points.T[np.argsort(-taken, kind="stable")[:REFINED]]
+    if np.exp(starts[0][1:2]) < rough:
+        return fitted(starts[0], slice(None))
     low, high = np.log([[0.1 * SLOWEST / length, SMALLEST_RATIO, 0.01], [np.pi / step, strongest, 1.0]])[:, :unknowns]
     ends = [
         least_squares(lambda z: fitted(z, fine).left / size, np.clip(z, low, high), bounds=(low, high), x_scale=0.1)
@@ -393,5 +398,5 @@ def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:
 
 @lru_cache(maxsize=8)
 def _fit_of(time: bytes, values: bytes) -> ViscousFit:
-    """``viscous_fit`` of bytes of float64: several checks of a record ask for its frequency."""
-    return viscous_fit(np.frombuffer(time), np.frombuffer(values))
+    """``viscous_fit`` of bytes of float64, rough where the decay is light: several checks ask for a record's frequency."""
+    return viscous_fit(np.frombuffer(time), np.frombuffer(values), rough=0.5 * PEAKLESS)
