@@ -109,6 +109,8 @@ def _refused(path: Path, error: OSError, needed: int) -> OutputError:
         text += f"; at least {needed / 1e6:.2f} MB are needed" if needed else ""
         text += f"; {shutil.disk_usage(there).free / 1e6:.2f} MB are left"
         choice = f"make space, or {choice}"
+    elif not folder.exists():
+        choice = f"make this folder, or {choice}"
     return OutputError(" ".join(f"{text}; {choice}".split()))
 
 

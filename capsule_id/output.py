@@ -56,17 +56,20 @@ def replace_file(path: Path, content: bytes | str, needed: int = 0) -> None:
 
 
 def replace_files(contents: Mapping[Path, bytes | str], needed: int = 0) -> None:
-    """As ``replace_file``; no file is renamed before all are written."""
+    """As ``replace_file``; no file is renamed before all are written. A pipe or a device is written into."""
     files = [Path(os.path.realpath(path)) for path in contents]  # a link stays
-    new = [path.with_name(path.name + NEW) for path in files]
+    new = [path if path.exists() and not path.is_file() else path.with_name(path.name + NEW) for path in files]
     try:
-        for path, content in zip(new, contents.values(), strict=True):
+        for path, file, content in zip(new, files, contents.values(), strict=True):
             write_file(path, content, needed)
+            with suppress(OSError):  # a new file has no older mode
+                shutil.copymode(file, path)
         for path, file in zip(new, files, strict=True):
-            with writing(file):
-                path.replace(file)
+            if path != file:
+                with writing(file):
+                    path.replace(file)
     except BaseException:  # of an interrupt too
-        for path in new:
+        for path in {*new} - {*files}:
             with suppress(OSError):
                 path.unlink()
         raise

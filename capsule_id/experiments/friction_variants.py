@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -44,7 +44,7 @@ class Variant:
 
     Attributes
     ----------
-    line : what ``[model]`` of rig.toml must say
+    model : the law
     values, sds : posterior means and standard deviations of the law's parameters, SI, by symbol
     log_likelihood : the largest of the sample
     evidence : log marginal likelihood
@@ -60,10 +60,6 @@ class Variant:
     bic: float
     lack_of_fit: float
 
-    @property
-    def line(self) -> str:
-        return model_lines(self.model)
-
 
 def candidates(experiments: Sequence[Any]) -> list[FrictionModel]:
     """Return the laws that the experiments can tell apart, the law in use included, the simplest first."""
@@ -78,24 +74,15 @@ def candidates(experiments: Sequence[Any]) -> list[FrictionModel]:
     return sorted({in_use, *models}, key=lambda m: (len(m.parameters), not m.constant, m.free))
 
 
-class Groups(NamedTuple):
-    """Readings of one experiment in groups of neighbours in speed, (g,) each; a short table has a group for every reading.
+def _grouped(e: Any, most: int) -> tuple[np.ndarray, ...]:
+    """The points of a friction experiment in ``most`` groups of neighbours in speed; each alone where they are no more.
 
-    speed, logs : means of the paper's points, m/s and logarithms of the coefficients
-    reading, per_scatter : relative sd of a point from the reading errors, and per unit of the scatter
-    number, spread : readings, and the sum of squares of their logarithms about the curve, from neighbours' differences
+    Returns
+    -------
+    (g,) each: means of the points' speeds, m/s, and of the logarithms of their coefficients; relative sd of a point from
+    the reading errors, and per unit of the scatter; number of points, and the sum of squares of their logarithms about
+    the curve, from the differences of neighbours.
     """
-
-    speed: np.ndarray
-    logs: np.ndarray
-    reading: np.ndarray
-    per_scatter: np.ndarray
-    number: np.ndarray
-    spread: np.ndarray
-
-
-def _grouped(e: Any, most: int) -> Groups:
-    """The points of a friction experiment in ``most`` groups at most."""
     speed, coefficient = e.paper_points()
     order = np.argsort(speed, kind="stable") if e.n > most else np.arange(e.n)
     first = np.unique(np.linspace(0, e.n, min(e.n, most), endpoint=False).astype(int))
@@ -108,7 +95,7 @@ def _grouped(e: Any, most: int) -> Groups:
 
     errors = (np.sqrt(mean(np.square(x))) for x in e.point_errors())
     logs = np.add.reduceat(logs, first) / number
-    return Groups(mean(speed), logs, *errors, number, np.add.reduceat(0.5 * step**2, first))
+    return mean(speed), logs, *errors, number, np.add.reduceat(0.5 * step**2, first)
 
 
 class VariantPoints:
@@ -118,9 +105,7 @@ class VariantPoints:
         self.experiments = tuple(experiments)
         self.n = sum(e.n for e in experiments)
         self.parts = [_grouped(e, -(-GROUPS * e.n // self.n)) for e in experiments]
-        self.speed, self.number, self.spread = (
-            np.concatenate([getattr(part, name) for part in self.parts]) for name in ("speed", "number", "spread")
-        )
+        self.speed, *_, self.number, self.spread = (np.concatenate(column) for column in zip(*self.parts, strict=True))
         rig = experiments[0].rig
         weighed = rig.m1 is not None and rig.m2 is not None
         self.normal_forces = [e.stated_normal_force if weighed else np.nan for e in experiments]
@@ -137,14 +122,16 @@ class VariantPoints:
         known = {row.symbol: theta[row.symbol] for row in model.parameters} | (CONSTANT if model.constant else {})
         viscous = known.pop("viscous", None)
         raw, sd = [], []
-        for e, part, N in zip(self.experiments, self.parts, self.normal_forces, strict=True):
+        for e, (speed, logs, reading, per_scatter, *_), N in zip(
+            self.experiments, self.parts, self.normal_forces, strict=True
+        ):
             own = {**known, "viscous": 0.0 if viscous is None else viscous / N}
             leaves = {name: value if np.ndim(value) == 0 else value[:, None, None] for name, value in own.items()}
             law = CoulombStribeck(N=1.0, **leaves)
             law = Reversed(law) if e.friction.direction == "backward" else law
-            scatter = theta[e.scatter.symbol][:, None] * part.per_scatter
-            raw.append(part.logs - np.log(e.paper_coefficient(law, part.speed)))
-            sd.append(np.sqrt(part.reading**2 + scatter**2 + SMALLEST_ERROR**2))
+            scatter = theta[e.scatter.symbol][:, None] * per_scatter
+            raw.append(logs - np.log(e.paper_coefficient(law, speed)))
+            sd.append(np.sqrt(reading**2 + scatter**2 + SMALLEST_ERROR**2))
         return np.concatenate(raw, axis=1), np.concatenate(sd, axis=1)
 
     def log_likelihood(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -280,7 +267,7 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
         "count": len(variants),
         "factor": float(np.exp(min(highest - used.evidence, 700.0))),
         "simplest": simplest.model.name,
-        "line": simplest.line,
+        "line": model_lines(simplest.model),
         "p": used.lack_of_fit,
     }
     names = tuple(row.name for row in in_use.parameters)
@@ -294,7 +281,7 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
             "BIC": variant.bic - min(other.bic for other in variants),
             "log marginal likelihood": variant.evidence - highest,
             "order of residuals, p": variant.lack_of_fit,
-            "[model]": variant.line,
+            "[model]": model_lines(variant.model),
         }
         for variant in variants
     ]

@@ -435,8 +435,7 @@ def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: 
     if target.work < HEAVY:
         return jax.vmap(of_row)(v, start, step)
     # JAX joins no batches of outputs without elements, which a target without scatters has.
-    together = ROWS_TOGETHER if layout.scatter else None
-    return jax.lax.map(lambda row: of_row(*row), (v, start, step), batch_size=together)
+    return jax.lax.map(lambda row: of_row(*row), (v, start, step), batch_size=ROWS_TOGETHER if layout.scatter else None)
 
 
 def _conditional(

@@ -66,8 +66,8 @@ def write_result(files: Mapping[str, bytes], directory: Path) -> None:
         If the operating system refuses.
     """
     needed = sum(map(len, files.values()))
-    with writing(directory):
-        (directory / "figures").mkdir(exist_ok=True)
+    with writing(figures := directory / "figures"):
+        figures.mkdir(exist_ok=True)
     for name, content in files.items():
         write_file(directory / name, content, needed)
         needed -= len(content)

@@ -335,3 +335,17 @@ def test_a_point_fit_in_an_odd_place(here: Path) -> None:
     os.close(writer)
     assert (left.returncode, left.stderr) == (0, b"")
     assert {path.name for path in (here / "results" / "small").iterdir()} == RESULT
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes and pipes")
+def test_a_replaced_file_keeps_its_mode_and_a_pipe_stays(tmp_path: Path) -> None:
+    old, pipe = tmp_path / "old", tmp_path / "pipe"
+    old.touch(mode=0o640)
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    replace_file(old, "new")
+    replace_file(pipe, "through")
+    assert (old.read_text(), old.stat().st_mode & 0o777) == ("new", 0o640)
+    assert os.read(reader, 99) == b"through"
+    os.close(reader)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["old", "pipe"]

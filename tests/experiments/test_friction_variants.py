@@ -163,3 +163,16 @@ def test_memory_grows_neither_with_particles_nor_with_readings(monkeypatch: pyte
     tracemalloc.stop()
     monkeypatch.setattr(friction_variants, "MOST_AT_ONCE", 10**9)
     np.testing.assert_array_equal(values, points.log_likelihood(model, theta))
+
+
+def test_groups_of_many_readings_say_what_the_readings_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evidences in groups of neighbours, beside those of the readings one by one."""
+    points = twin(4, 1200, CoulombStribeck(0.65, 1.0, 0.1))
+    models = [FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",))]
+    grouped = [fit_variant(VariantPoints(points), model, seed=0) for model in models]
+    monkeypatch.setattr(friction_variants, "GROUPS", 1200)
+    alone = [fit_variant(VariantPoints(points), model, seed=0) for model in models]
+    for one, other in zip(grouped[1:], alone[1:], strict=True):
+        assert abs(one.values["mu"] - other.values["mu"]) < 0.3 * other.sds["mu"]
+        assert one.evidence - grouped[1].evidence == pytest.approx(other.evidence - alone[1].evidence, abs=1.0)
+    assert grouped[0].evidence < grouped[1].evidence - 100.0

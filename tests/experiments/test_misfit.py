@@ -1,11 +1,13 @@
 """A misfit's density at many values of its scatter, against SciPy at each of them."""
 
+from types import ModuleType
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.experiments.misfit import MANY_NUISANCES, Misfit, Moments
+from capsule_id.experiments.misfit import MANY_NUISANCES, MANY_READINGS, Misfit, Moments
 
 RNG = np.random.default_rng(5)
 RAW, DESIGN = RNG.standard_normal(7), RNG.standard_normal((7, 3))
@@ -50,3 +52,19 @@ def test_the_ordinate_normalises() -> None:
     for part in (misfit, misfit.summary()):
         difference = float(part.log_density(0.7, np)) - float(ONE_VARIANCE.log_density(0.7, np))
         assert difference == pytest.approx(np.sum(measure), rel=1e-12)
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.parametrize("columns", [0, 2, MANY_NUISANCES + 2])
+@pytest.mark.parametrize("ratio", [1.0, 7.0, 30.0])
+def test_many_readings_of_unequal_variance(columns: int, ratio: float, xp: ModuleType) -> None:
+    """As summed one by one, at scatters far below, within and far above the reading errors."""
+    rng, n = np.random.default_rng(3), 4 * MANY_READINGS
+    scale = rng.permutation(np.geomspace(1.0, ratio, n)) ** 2
+    variance = 4e-4 * scale
+    raw, design = np.sqrt(variance) * rng.standard_normal(n), scale[:, None] * rng.standard_normal((n, columns))
+    misfit, scatters = Misfit(raw, variance, scale, design), np.geomspace(1e-5, 1.0, 7)
+    summed = misfit.summary(xp)
+    assert isinstance(summed, Moments)
+    expected = misfit.log_density(scatters, np)
+    np.testing.assert_allclose(summed.log_density(scatters, xp), expected, rtol=1e-9, atol=1e-5)

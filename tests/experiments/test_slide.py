@@ -1,5 +1,7 @@
 """Eq. (1) and the slide that follows from it: against SciPy's quadrature and against the dilogarithm."""
 
+from types import ModuleType
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -59,3 +61,13 @@ def test_paper_fit_recovers_its_own_curve() -> None:
     assert fit["v_s"] == pytest.approx(V_S, rel=1e-6)
     assert paper_friction_fit(np.zeros(2), np.array([0.6, 0.7])) == {"mu": pytest.approx(0.65)}
     assert paper_friction_fit(np.array([0.3, 0.3]), np.array([0.5, 0.5])) == {}
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.parametrize(("lowest", "error"), [(0.15, 2e-8), (1e-3, 2e-6)])
+def test_many_slides_share_panels(lowest: float, error: float, xp: ModuleType) -> None:
+    """The error is largest where v_s is small beside the largest speed."""
+    for v_s in (0.01, 0.1, 1.0):
+        speed, law = np.linspace(1.0, lowest, 97), unit_law(MU, v_s)
+        alone = np.concatenate([slide_distance(law, 1.0 / G, part) for part in np.split(speed, 97)])
+        np.testing.assert_allclose(slide_distance(law, 1.0 / G, xp.asarray(speed)), alone, rtol=error)

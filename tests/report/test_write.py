@@ -199,7 +199,7 @@ def test_csv_reads_back(folder: Path, result: Result) -> None:
 
 
 def test_directory_must_exist(result: Result, tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="No such file"):
+    with pytest.raises(OutputError, match="No such file or directory; make this folder"):
         write_result(result_files(result), tmp_path / "absent")
     assert not (tmp_path / "absent").exists()
 

@@ -291,7 +291,7 @@ def viscous_fit(
     ridge = SINGULAR * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(square.shape[1])
     taken = np.sum(product * np.linalg.solve(square + ridge, product[..., None])[..., 0], axis=1)
     starts = points.T[np.argsort(-taken, kind="stable")[:REFINED]]
-    if np.exp(starts[0][1:2]) < rough:
+    if rough > 0.0 and np.exp(starts[0][1]) < rough:
         return fitted(starts[0], slice(None))
     low, high = np.log([[0.1 * SLOWEST / length, SMALLEST_RATIO, 0.01], [np.pi / step, strongest, 1.0]])[:, :unknowns]
     ends = [

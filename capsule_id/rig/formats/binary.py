@@ -16,6 +16,7 @@ from functools import lru_cache
 from importlib import import_module
 from math import prod
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -82,9 +83,11 @@ class ArraysReader:
 # The file is given as bytes, so that no other file is read.
 
 
-#: Longest time to read a small HDF5 file, s, bytes that a larger one has for each further second, and memory of the
-#: process beyond that of the file, bytes.
+#: Longest time to read a small HDF5 file, s of the processor, bytes that a larger one has for each further second, and
+#: memory of the process beyond that of the file, bytes.
 LONGEST_READING, BYTES_PER_SECOND, SPARE_MEMORY = 8, 1 << 25, 1 << 29
+#: Time beside that, s, in which a busy machine starts the process.
+LONGEST_START = 60
 
 
 def _data_sets(content: bytes, path: Path) -> Named:
@@ -103,7 +106,7 @@ def _data_sets(content: bytes, path: Path) -> Named:
             stderr=subprocess.DEVNULL,
             env=surroundings,
             start_new_session=True,
-            timeout=_longest(content),
+            timeout=LONGEST_START + _longest(content),
             check=False,
         )
         out = io.BytesIO(done.stdout)
@@ -130,10 +133,11 @@ def serve_hdf5() -> None:
     content, out, path = sys.stdin.buffer.read(), sys.stdout.buffer, Path(sys.argv[1])
     fault: Any = None
     try:
-        with suppress(ImportError):  # Windows has no such limits; the time is limited by the process that waits
+        with suppress(ImportError):  # Windows has no such limits; the time is limited by the process that waits alone
             resource: Any = import_module("resource")
             most = 2 * len(content) + 4 * largest(content) + SPARE_MEMORY
-            for kind, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, _longest(content))):
+            longest = 1 + int(process_time()) + _longest(content)  # the start does not count
+            for kind, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, longest)):
                 with suppress(ValueError, OSError):  # a lower limit holds already, or the system has none of this kind
                     resource.setrlimit(kind, (limit, limit))
         with complete(path, "export it again"):

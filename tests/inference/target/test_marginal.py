@@ -15,7 +15,7 @@ from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.curvature import BATCH, hessian
-from capsule_id.inference.marginal import MarginalPosterior, conditional, density_of, uniform_at
+from capsule_id.inference.marginal import HEAVY, MarginalPosterior, conditional, density_of, uniform_at
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
@@ -280,3 +280,12 @@ def test_numbers_of_a_place_are_uniform_and_independent() -> None:
     pairs = np.corrcoef(np.hstack([found[:-1], found[1:]]), rowvar=False)
     assert np.max(np.abs(pairs - np.eye(6))) < 4.0 / np.sqrt(4000.0)
     np.testing.assert_array_equal(uniform_at(np.hstack([v, v])[7:8], 3), found[7:8])
+
+
+def test_a_heavy_table_without_scatters_has_a_density() -> None:
+    current = np.linspace(0.25, 2.0, HEAVY + 1)
+    columns = [bench.column("force", 2.0 * current, 0.03), bench.column("current", current, 0.01)]
+    rig = bench.rig(bench.table("motor_current", columns))
+    target = LogPosterior(rig, make_experiments(rig))
+    u = np.log([[2.0], [2.002]])
+    np.testing.assert_allclose(density_of(target)(u), log_posterior(target, u), rtol=1e-9)

@@ -224,6 +224,34 @@ def test_a_library_that_never_returns_or_ends_its_process_is_stopped(
 ) -> None:
     start = subprocess.Popen
     monkeypatch.setattr(binary, "LONGEST_READING", 1)
+    monkeypatch.setattr(binary, "LONGEST_START", 0)
     monkeypatch.setattr(subprocess, "Popen", lambda words, **options: start([*words[:3], code, *words[4:]], **options))
     error = refusal(".h5", hdf5(COLUMNS))
     assert "more than 1 s, or ends the HDF5 library" in str(error)
+
+
+SERVE = "import time; from capsule_id.rig.formats import binary; binary.LONGEST_READING = 1; {}; binary.serve_hdf5()"
+
+
+@pytest.mark.parametrize(
+    ("planted", "fault"),
+    [
+        ("time.sleep(2)", None),
+        (
+            "binary._read_data_sets = lambda *_: (0 for zero in iter(int, 1) if zero)",
+            "more than 1 s, or ends the HDF5 library",
+        ),
+        ("binary._read_data_sets = lambda *_: iter([bytearray(1 << 33)])", "MemoryError"),
+    ],
+)
+def test_limits_of_the_process_that_reads(planted: str, fault: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slow start is no fault of the file; the time and the memory of the reading have limits."""
+    start, code = subprocess.Popen, SERVE.format(planted)
+    monkeypatch.setattr(binary, "LONGEST_READING", 1)
+    monkeypatch.setattr(subprocess, "Popen", lambda words, **options: start([*words[:3], code, *words[4:]], **options))
+    if fault is None:
+        assert EXPORTS[".h5"](hdf5(COLUMNS), Path("f.h5"), LAYOUT).headers[0] == ("t", "x")
+    else:
+        began = time.perf_counter()
+        assert fault in str(refusal(".h5", hdf5(COLUMNS)))
+        assert time.perf_counter() - began < 0.5 * binary.LONGEST_START
