@@ -135,12 +135,12 @@ def _write(
     import pandas as pd
     import xarray as xr
 
-    from capsule_id.report.write import netcdf_bytes
-
     if path.suffix == ".csv":
         table = {"time [s]": time} | {f"{name} [{COLUMNS[name][0]}]": values for name, values in columns.items()}
         replace_file(path, pd.DataFrame(table).to_csv(index=False, lineterminator="\n"))
         return
+    from capsule_id.report.write import netcdf_bytes  # with Matplotlib
+
     about = {name: {"units": unit, "long_name": meaning} for name, (unit, meaning) in COLUMNS.items()}
     data = {name: ("time", values, about[name]) for name, values in columns.items()}
     replace_file(path, netcdf_bytes(xr.Dataset(data, {"time": ("time", time, {"units": "s"})}, dict(provenance))))

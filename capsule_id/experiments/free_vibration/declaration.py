@@ -200,13 +200,13 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
         if likelihood_gain(fit, viscous_fit(time, values, 3, CHANNELS[channel].order)) > BETTER:
             value = f"one stroke of {len(values)} samples, after which dry friction holds the rod"
             raise InputError(rule, value, "release it from a larger deflection, or reduce the friction", *place)
-        short = fit.omega * np.ptp(time) < SLOWEST
-        if short or likelihood_gain(viscous_fit(time, values, 1), fit) < 2.0 * BETTER:
+        alone = likelihood_gain(viscous_fit(time, values, 1), fit) < 2.0 * BETTER
+        if alone or fit.omega * np.ptp(time) < SLOWEST:
             remedy = (
                 'where each row is a turning point, state samples = "turning_points"; else record from the release on, with '
                 "at least 10 samples before the rod is at half its deflection"
             )
-            shown = "no return to rest in {}" if short else "one exponential in {}, which gives c/k1 alone"
+            shown = "one exponential in {}, which gives c/k1 alone" if alone else "no return to rest in {}"
             raise InputError(rule, shown.format(f"{len(values)} samples"), remedy, *place)
         if fit.ratio > STRONGEST and DecayModel.stated(table.settings).symbols:
             rule = f"further forces need a damping ratio below {STRONGEST:g}"
