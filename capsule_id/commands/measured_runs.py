@@ -26,7 +26,7 @@ def overlay(
     fitted: Mapping[str, float],
     spring: str | None = None,
 ) -> tuple[list[MeasuredPoint], str]:
-    """The forced runs of ``rig`` on a diagram over a quantity, and a line with their number and the reasons for the others.
+    """Runs of ``rig`` with the settings of a diagram, as its points; and a text: how many, and why others are left out.
 
     Parameters
     ----------

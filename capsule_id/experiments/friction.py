@@ -112,7 +112,7 @@ MESSAGES = {
         "friction law",
         ok=(
             "the readings do not reject {name}: the best of {count} friction laws is {factor:.2g} times as probable. The "
-            "simplest law that they do not tell from the best is {simplest}: {line} in [model]"
+            "simplest law that the readings cannot tell from the best is {simplest} (in [model]: {line})"
         ),
         fail=(
             "{labels}: expected readings that {name} explains; found them {factor:.3g} times more probable under another "

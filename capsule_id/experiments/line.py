@@ -59,8 +59,8 @@ MESSAGES = {
     "lines.step": Message(
         "scatter of calibration lines",
         warn=(
-            "the readings lie closer to the line than their step, so the sd of {name} follows from the step of their digits, "
-            "{step:g} {unit}. State {y}_resolution or {y}_sd."
+            "the readings scatter less about the line than rounding to {step:g} {unit}, their last digit, lets them, so the "
+            "sd of {name} follows from this step. State {y}_resolution or {y}_sd."
         ),
     ),
     "lines.slopes": Message(

@@ -214,7 +214,7 @@ def with_line(findings: Sequence[Finding], rig: Rig) -> Iterable[Finding]:
 
 
 def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> tuple[Finding, ...]:
-    """Return findings on masses and readings; they enter the verdict of a fit.
+    """Return findings on the readings, settings and masses; they count in the verdict of a fit.
 
     Parameters
     ----------

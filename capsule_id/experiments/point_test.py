@@ -87,7 +87,7 @@ class PointTest(GroundExperiment):
         """The reading, SI, () or (n,), at ``theta`` and the columns ``x``; NumPy and JAX."""
 
     def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
-        """Derivative of the prediction with respect to every one of ``uncertain``, () or (n,)."""
+        """Derivative of the prediction by each column of ``uncertain``, by name; () or (n,)."""
         return _slopes(self, theta) if self.uncertain else {}
 
     def change(self, theta: ValuesBySymbol) -> Any:

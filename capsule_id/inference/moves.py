@@ -227,7 +227,7 @@ class RandomWalk:
 
 
 class Rescaling:
-    """Metropolis steps along which the products of a scale and its factors, or what balances them, keep the motion.
+    """Metropolis steps that change a scale and its factors, or the factors and what balances them, but not the motion.
 
     A step multiplies the scale and divides its factors by the same number; or it adds a number to all factors, and
     divides what they balance by the exponential of its product with the scale. Where readings determine only products,

@@ -79,7 +79,7 @@ def smoothing_certificate(target: LogPosterior, fit: PointFit) -> ResultTable:
 
 
 def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing | None) -> tuple[np.ndarray, np.ndarray]:
-    """(d_located,) shift of u between a fit with the engine of ``widths`` (None: exact) and this fit, and the sd of u."""
+    """Change of u, (d_located,), if this fit used the engine of ``widths`` (None: exact), by one step; and the sd of u."""
     own, jacobian = linearised(target, fit.u, fit.u[target.located])
     normal = jacobian.T @ jacobian
     step = -np.linalg.solve(normal, jacobian.T @ (_residuals(_by_engine(target, widths), fit) - own))

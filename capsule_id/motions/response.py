@@ -61,7 +61,7 @@ def observe(
     max_steps: int,
     width: int = CHUNK,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(closings, work, status) of motions whose states at the periods' ends are known: each period, the gravest status.
+    """(closings, work, status): contacts that close and work in each period, and the gravest status of each motion.
 
     Parameters
     ----------

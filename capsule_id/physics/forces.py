@@ -105,8 +105,8 @@ class Force:
 
     ``CapsuleParameters(..., forces=(force, ...))`` takes any number of them. With a gap it is a contact, which acts
     while d = side r - gap >= 0; without one it acts always, with d = r. The formulas work elementwise on NumPy and JAX
-    arrays. The exact engine evaluates them on Taylor series: made of +, - and * and whole powers (a Python ``int``) of d
-    and w they are exact there; all others it refuses, and any on a prescribed rod. The smoothed engine takes any.
+    arrays. The exact engine evaluates them on Taylor series: made of +, - and * and whole powers (a Python ``int``, no
+    leaf) of d and w they are exact there; all others it refuses, and any on a prescribed rod. The smoothed engine takes any.
 
     parameters : a row for each leaf that is to be checked, with the leaf's name as its symbol
     """

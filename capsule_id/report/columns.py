@@ -149,7 +149,7 @@ class Row:
 
     @property
     def interval(self) -> str:
-        """The ends of the 95 % interval; a dash where one is missing."""
+        """Both ends of the 95 % interval; a single dash if one is missing."""
         ends = self._printed("lower"), self._printed("upper")
         return MISSING if MISSING in ends else " to ".join(ends)
 

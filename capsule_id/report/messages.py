@@ -548,7 +548,7 @@ FIT_MESSAGES: Mapping[str, Message] = {
         "order of trials",
         ok="residuals of neighbouring rows are uncorrelated in {number:# table}",
         fail=(
-            "expected residuals without order; those of neighbouring rows have correlation {correlation:.2f} over {rows} rows "
+            "expected independent residuals; those of neighbouring rows have correlation {correlation:.2f} over {rows} rows "
             "({p:p}). The trials drift or come in sessions: an sd of independent trials is too small by a factor "
             "of about {factor:.1f}. Repeat the trials in random order, with the test set up anew between them."
         ),

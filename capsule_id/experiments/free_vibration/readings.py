@@ -239,7 +239,7 @@ _NOISES = {"ar1": "coloured noise (AR(1))", "arma": "white and coloured noise (A
 
 
 def natural_units(k1: Any, m1: Any, size: Any) -> dict[str, Any]:
-    """Parameters of the further forces that change a motion of this ``size``, m, by as much as itself, SI, by symbol."""
+    """For each further force the parameter that makes it as large as the spring force at ``size``, m; SI, by symbol."""
     return {"F_dry": k1 * size, "c_q": m1 / size, "k_cubic": k1 / size**2}
 
 
@@ -286,7 +286,7 @@ class DecaySettings(GroundSettings):
 
     @property
     def offers_cubic(self) -> bool:
-        """Whether a cubic spring may be fitted where no stiffness is stated: on a slope it is refused."""
+        """Whether a second fit may choose a cubic spring where no stiffness is stated: not on a slope."""
         return "slope" not in self.ground
 
 

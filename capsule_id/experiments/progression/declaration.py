@@ -203,7 +203,7 @@ MESSAGES = {
     "progression.sessions": Message(
         "sessions",
         warn="{several:# session} with several settings, and only {most} of them have their friction as a parameter. The "
-        "fit takes each of the others for a new session at every setting, so that intervals are too narrow: write one "
+        "fit takes each remaining session for a new one at every setting, so that intervals are too narrow: write one "
         "table and one entry for each day or location",
         caption=(
             "Sessions with several settings: the parameter of each one, its number in the file, how many settings and trials "

@@ -215,7 +215,7 @@ class Emulator(eqx.Module):
         )
 
     def _features(self, x: Any, xp: Any) -> Any:
-        """(n, features + 1 + p) of inputs (n, p)."""
+        """(n, features + 1 + p): cosines, 1 and scaled inputs, of the inputs ``x`` (n, p)."""
         z = (x - self.centre[None]) / self.scale[None]
         waves = _cosine(z @ self.frequencies + self.phases[None], xp)
         return xp.concatenate([waves, xp.ones((len(z), 1)), z], axis=1)
