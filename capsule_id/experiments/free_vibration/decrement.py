@@ -262,21 +262,9 @@ def viscous_fit(
     wide = np.geomspace(SLOWEST / length, np.pi / step, WIDE_POINTS)
     tried = [*itertools.product(near[near > 0.0], LIGHT_RATIOS), *itertools.product(wide, STRONG_RATIOS)]
 
-    def motions(z: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """(..., n, 1 or 2) of the unknowns z, (number, ...)."""
-        omega, ratio, share = np.exp([*z, *np.full((3 - unknowns, *z.shape[1:]), np.inf)])[..., None]
-        if unknowns == 1:
-            return np.exp(-omega * t)[..., None]
-        if unknowns == 2:
-            return viscous_basis(t, omega**2, 2.0 * ratio * omega, 1.0, np)
-        # Backwards in time from the stop, at a share of the half period, damping is negative.
-        left = share * np.pi / (omega * np.sqrt(1.0 - ratio**2)) - t
-        basis = viscous_basis(np.maximum(left, 0.0), omega**2, -2.0 * ratio * omega, 1.0, np)
-        return (basis[..., :1], basis[..., 1:], basis * (left > 0.0)[..., None])[order]
-
     def fitted(z: np.ndarray, part: slice) -> ViscousFit:
         omega, ratio = np.exp([*z, np.inf][:2])
-        design = np.column_stack([motions(z, time[part]), np.ones(len(time[part]))])
+        design = np.column_stack([_motions(z, time[part], unknowns, order), np.ones(len(time[part]))])
         parts = np.linalg.lstsq(design, values[part])[0]
         return ViscousFit(float(ratio * omega), float(omega**2), parts, values[part] - design @ parts)
 
@@ -285,7 +273,7 @@ def viscous_fit(
     points = np.log([[*pair, 0.9] for pair in tried if unknowns == 2 or pair[1] < LARGEST_RATIO]).T[:unknowns]
     points = np.unique(points, axis=1)
     # The part of each point in the sum of squares about the mean, by the normal equations.
-    moved = motions(points, time[few])
+    moved = _motions(points, time[few], unknowns, order)
     moved -= np.mean(moved, axis=1, keepdims=True)
     square, product = np.swapaxes(moved, 1, 2) @ moved, (values[few] - np.mean(values[few])) @ moved
     ridge = SINGULAR * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(square.shape[1])
@@ -299,6 +287,19 @@ def viscous_fit(
         for z in starts
     ]
     return fitted(min(ends, key=lambda one: one.cost).x, slice(None))
+
+
+def _motions(z: np.ndarray, t: np.ndarray, unknowns: int, order: int) -> np.ndarray:
+    """(..., n, 1 or 2) of the ``unknowns`` z, (number, ...); see ``viscous_fit``."""
+    omega, ratio, share = np.exp([*z, *np.full((3 - unknowns, *z.shape[1:]), np.inf)])[..., None]
+    if unknowns == 1:
+        return np.exp(-omega * t)[..., None]
+    if unknowns == 2:
+        return viscous_basis(t, omega**2, 2.0 * ratio * omega, 1.0, np)
+    # Backwards in time from the stop, at a share of the half period, damping is negative.
+    left = share * np.pi / (omega * np.sqrt(1.0 - ratio**2)) - t
+    basis = viscous_basis(np.maximum(left, 0.0), omega**2, -2.0 * ratio * omega, 1.0, np)
+    return (basis[..., :1], basis[..., 1:], basis * (left > 0.0)[..., None])[order]
 
 
 def likelihood_gain(one: ViscousFit, other: ViscousFit) -> float:
