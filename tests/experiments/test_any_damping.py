@@ -2,22 +2,27 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
+from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.decrement import (
     decay_frequency,
     likelihood_gain,
     viscous_fit,
 )
+from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_aliases
 from capsule_id.experiments.free_vibration.second_fit import Screening, open_models, rank
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from tests.experiments import random_decays
+from tests.experiments import bench, random_decays
 from tests.experiments.test_second_fit import SPRING_FORCE, record
 from tests.scipy_decay import scipy_decay
 
@@ -287,6 +292,31 @@ def test_the_rest_of_an_overdamped_decay_is_not_clipped(tmp_path: Path) -> None:
     struck = 1e-5 * np.round(2e-3 * np.minimum(struck / np.max(struck), 0.7) / 1e-5)
     rig = cid.read_rig(folder(tmp_path / "blow", time, struck, m1))
     assert "readings.clipped" in {found.code for found in lint(rig, kinds, rig.tables)}
+
+
+def test_no_start_is_proposed_that_leaves_too_few_samples(tmp_path: Path) -> None:
+    """Swings with clipped peaks, whose last clipped sample stands before 3 samples, or before 11."""
+    time = np.arange(1050) / 1000.0
+    swings = np.minimum(np.cos(20.0 * np.pi * time), 0.9)
+    last = int(np.flatnonzero(swings == 0.9)[-1])
+    for end, cut in ((last + 4, "Record again."), (last + 12, "start = ")):
+        rig, kinds = cid.read_rig(folder(tmp_path / str(end), time[:end], 1e-3 * swings[:end], 0.1)), default_registry()
+        (found,) = (one for one in lint(rig, kinds, rig.tables) if one.code == "readings.clipped")
+        assert cut in found.facts["cut"]
+
+
+def test_the_alias_of_even_samples_is_told_for_the_records_that_have_it() -> None:
+    """Before: the alias of the lower sampling rate for both records, the other of which excludes it."""
+    records = []
+    for label, rate in (("slow", 100.0), ("fast", 400.0), ("slow_too", 100.0)):
+        time = np.arange(0.0, 1.0, 1.0 / rate)
+        columns = [bench.column("time", time), bench.column("x_rel", bench.released(time, 2e-3))]
+        table = replace(bench.table("free_vibration", columns), label=label)
+        records.append(FreeVibration(table, bench.rig(table)))
+    (found,) = check_aliases(records, cast(Fitted, SimpleNamespace(values={"k1": bench.K1, "m1": bench.M1})))
+    assert found.facts["labels"] == "slow, slow_too"
+    frequency = np.sqrt(bench.K1 / bench.M1) / (2.0 * np.pi)
+    assert found.facts["other"] == pytest.approx(100.0 - frequency)
 
 
 @pytest.mark.parametrize(
