@@ -42,7 +42,14 @@ from capsule_id.physics.forces import warn_of_far_gap
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory
 from capsule_id.physics.simulation import simulate
-from capsule_id.report.columns import sampled_parameters, table_rows, table_text, verdict_text, wrapped
+from capsule_id.report.columns import (
+    errors_left_out,
+    sampled_parameters,
+    table_rows,
+    table_text,
+    verdict_text,
+    wrapped,
+)
 from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import subfigure_at
 from capsule_id.report.html import summary_html
@@ -88,10 +95,12 @@ class Fit(Result):
 
     @property
     def remarks(self) -> list[str]:
-        """Texts that the console shows under the table: a quoted model that is not the stated one, and unusual magnitudes."""
+        """Texts that the console shows under the table: a quoted model that is not the stated one, unusual magnitudes, and
+        errors of instruments that no sd contains.
+        """
         messages = messages_of(self.registry)
         found = [f for f in self.findings if f.code in messages and messages[f.code].on_console and f.level != "ok"]
-        return list(dict.fromkeys(self.text(f) for f in found))
+        return [*dict.fromkeys(self.text(f) for f in found), *errors_left_out(self.summary)]
 
     def text(self, item: Finding | ResultTable) -> str:
         """What a finding says (what was expected, what was found, what to do), or the caption of a table."""

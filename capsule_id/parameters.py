@@ -121,6 +121,11 @@ class Parameter:
         return str(Name(self.symbol, self.of))
 
     @property
+    def key(self) -> str:
+        """How an experiment knows its value: by symbol, or by name where it may have several of this symbol."""
+        return self.name if self.symbol in INSTRUMENT_ERRORS else self.symbol
+
+    @property
     def label(self) -> str:
         """LaTeX label with the bracket as a subscript text."""
         return f"${self.latex}$ [{self.of}]" if self.of else f"${self.latex}$"
@@ -270,10 +275,16 @@ TABLE: Mapping[str, Parameter] = {
         nuisance("x_start", "m", "x_rel at the start of a record", "x_0"),
         nuisance("y_start", "m/s", "rate of x_rel at the start of a record", "y_0"),
         nuisance("clock_drift", "1", "drift of the clock of a record", r"\delta_\mathrm{clock}"),
+        nuisance("gain", "1", "relative error of the gain of an instrument", r"\gamma"),
+        nuisance("offset", "by the column", "reading of an instrument at 0", "o"),
         scatter("scatter", "N", "scatter about a calibration line", "s"),
     )
 }  # fmt: skip
 
+#: Symbols of the errors of instruments. An experiment may read several instruments: it knows their errors by name.
+INSTRUMENT_ERRORS = ("gain", "offset")
+#: The errors of instruments that an sd may not contain, in words.
+INSTRUMENT_WORDS = ("clock", "gain", "zero")
 #: The drives that a command can be given, and the leaves of each.
 DRIVES: Mapping[str, tuple[str, ...]] = {
     "harmonic": ("P_d", "Omega", "phase", "reaction"),
@@ -306,4 +317,4 @@ def symbol_of(name: str) -> str:
 
 def is_stated(name: str) -> bool:
     """Whether rig.toml states the parameter: its prior is a reading, and tests are not meant to narrow it."""
-    return symbol_of(name) in ("m1", "m2", "slope", "N0", "clock_drift")
+    return symbol_of(name) in ("m1", "m2", "slope", "N0", "clock_drift", *INSTRUMENT_ERRORS)

@@ -26,8 +26,8 @@ HEAD = """\
 #:   Without a time column: time = { rate = { value = 1000, unit = "Hz" } }. Further keys, where needed:
 #:   files = ["a.csv", "b.csv"] instead of file; data_from_line = 3; data_to_line = 90
 #:   decimal = ","; missing = ["--", "NaN"]; where = { tau = 30 }.
-#: Every experiment has three optional keys: label = "..." is its unique name (default: the file without suffix);
-#: <column>_sd states a reading error; <column>_resolution states a reading step.
+#: Every experiment has four optional keys: label = "..." is its unique name (default: the file without suffix);
+#: <column>_sd states a reading error; <column>_resolution a reading step; <column>_instrument names an instrument.
 
 [rig]
 name = "@NAME@"
@@ -54,6 +54,16 @@ name = "@NAME@"
 # free = ["ratio"]
 # reaction = "ground"
 # engine = "exact"
+
+#: Instruments: errors that all readings of one share, as its certificate states them. No sd holds what is not stated.
+#: The columns that it read name it: force_instrument = "cell", time_instrument = "logger" in their experiments.
+#:   [[instrument]]
+#:   name = "cell"
+#:   gain = { expanded = 1, k = 2, unit = "%" }          (or { half_width = 0.5, unit = "%" }, or { sd = 0.5, unit = "%" })
+#:   offset = { sd = 0.02, unit = "N" }                  (in the unit of its columns)
+#:   [[instrument]]
+#:   name = "logger"
+#:   clock = { value = 0, sd = 50, unit = "ppm" }
 
 #: Priors: knowledge from before the measurement. Default priors are broad.
 #: Log-normal, 95 % within median/factor to median*factor: @LOGNORMAL@.

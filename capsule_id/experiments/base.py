@@ -17,7 +17,7 @@ from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.precision import require_float64
-from capsule_id.rig.model import Column, Rig, Table
+from capsule_id.rig.model import NO_DRIFT, Column, Rig, Table
 from capsule_id.views import Comparison, Facts, Finding
 
 # base: Base class of experiments: their interface to inference and to the report.
@@ -160,6 +160,10 @@ class Experiment(eqx.Module):
         """Number of readings that enter the likelihood."""
         return len(self.observed)
 
+    def unstated_errors(self, symbol: str) -> set[str]:
+        """Of the errors ``INSTRUMENT_WORDS``, those that move the parameter ``symbol`` and that rig.toml does not state."""
+        return {"clock"} if "time" in self.table.columns and self.table.drift == NO_DRIFT else set()
+
     @property
     def work(self) -> int:
         """Time of an evaluation of the likelihood, in units of that of one reading."""
@@ -171,7 +175,7 @@ class Experiment(eqx.Module):
 
     def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Select values by symbol from values by name."""
-        own = {row.symbol: values[row.name] for row in self.parameters}
+        own = {row.key: values[row.name] for row in self.parameters}
         return own | {name: values[name] for name in (*self.masses, "g") if name in values}
 
     @property
@@ -344,12 +348,19 @@ def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
 
 
 def clock_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
-    """The drift of the table's clock where its sd is stated; tables with equal statements share one clock."""
+    """The drift of the table's clock where its sd is stated; tables of one logger, or with equal statements, share it."""
     stated = table.drift
     if stated.sd == 0.0:
         return ()
-    same = (other.label for other in rig.tables if other.drift == stated)
-    return (parameter("clock_drift", next(same, table.label), Prior("normal", stated.value, stated.sd)),)
+    logger = _logger(table)
+    same = (other.label for other in rig.tables if other.drift == stated and not _logger(other))
+    return (parameter("clock_drift", logger or next(same, table.label), Prior("normal", stated.value, stated.sd)),)
+
+
+def _logger(table: Table[Any]) -> str:
+    """Name of the instrument that read the times; "" where it is not stated."""
+    instrument = table.columns["time"].instrument if "time" in table.columns else None
+    return "" if instrument is None else instrument.name
 
 
 def stated_rate(table: Table[Any]) -> float | None:

@@ -113,9 +113,15 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
 
 
 def _check_ground(entry: Entry[PushSettings]) -> None:
-    """Refuse a slope for the capsule model of a free rod."""
+    """Refuse a slope and instruments for the capsule model of a free rod."""
     if entry.table.settings.forward == "capsule":
         entry.refuse_ground("slope", 'pushes with forward = "capsule" must be on level ground')
+        for name, column in entry.table.columns.items():
+            if column.instrument is not None:
+                rule = 'pushes with forward = "capsule" take no instrument'
+                raise entry.error(
+                    f"{name}_instrument", rule, column.instrument.name, 'remove it, or forward = "capsule"'
+                )
 
 
 TEMPLATE = """\
@@ -140,6 +146,7 @@ KIND = Kind(
     rules=(_check_ground,),
     masses_of_free=MASSES_OF_FREE,
     parameters=(PUSH_SCATTER,),
+    has_instruments=True,
     make=made_by(
         "capsule_id.experiments.dynamic_friction:DynamicFriction",
         capsule="capsule_id.experiments.capsule_experiment:CapsulePushes",

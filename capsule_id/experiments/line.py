@@ -284,6 +284,10 @@ class Line(PointTest):
     def scatters(self) -> tuple[str | None, ...]:
         return (None,) if self.scale_known else ("scatter",)
 
+    def unstated_errors(self, symbol: str) -> set[str]:
+        """The intercept takes up the zeros of both columns."""
+        return super().unstated_errors(symbol) - {"zero"}
+
     @property
     def errors(self) -> str:
         """Error model in words, for the report."""

@@ -61,6 +61,7 @@ KIND = Kind(
     sets=(("force", "current"),),
     settings=MotorSettings,
     rules=(refuse_idle_sd_ratio,),
+    has_instruments=True,
     make=made_by("capsule_id.experiments.motor_current:MotorCurrent"),
     template=TEMPLATE,
     informs="K",

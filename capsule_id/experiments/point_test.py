@@ -25,7 +25,7 @@ from capsule_id.experiments.friction_model import (
     ground_parameters,
 )
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.parameters import Parameter, parameter
+from capsule_id.parameters import INSTRUMENT_ERRORS, Name, Parameter, Prior, parameter
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.rig.schema import GroundSettings
 from capsule_id.views import Comparison, Curve, Points
@@ -44,11 +44,15 @@ class PointTest(GroundExperiment):
     readings : by column, SI: (n,), or () where all rows have one value
     sds : their reading errors, () or (n,), by column
     uncertain : columns other than the reading that have errors
+    instruments : names of the instruments that read the columns, by column
+    stated_errors : of these instruments, SI, by name (``gain[lvdt]``)
     """
 
     readings: dict[str, np.ndarray]
     sds: dict[str, Any]
     uncertain: tuple[str, ...] = eqx.field(static=True)
+    instruments: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    stated_errors: dict[str, float]
 
     #: Column that is predicted.
     reading: ClassVar[str]
@@ -68,7 +72,10 @@ class PointTest(GroundExperiment):
         others = (name for name in self.sds if name != self.reading)
         self.uncertain = tuple(name for name in others if np.any(np.asarray(self.sds[name]) > 0.0))
         ground = ground_parameters(table, rig) if on_track else ()
-        self.about = About(table, rig, (*self.own_parameters(table), *ground))
+        read_by = {name: c.instrument for name, c in table.columns.items() if c.instrument is not None}
+        self.instruments = tuple((name, one.name) for name, one in read_by.items())
+        self.stated_errors = {str(Name(s, i.name)): q.value for i in read_by.values() for s, q in i.errors.items()}
+        self.about = About(table, rig, (*self.own_parameters(table), *ground, *instrument_parameters(table)))
 
     def read(self, table: Table) -> tuple[dict[str, Any], dict[str, Any]]:
         """``readings`` and ``sds`` of a table."""
@@ -85,6 +92,35 @@ class PointTest(GroundExperiment):
     @abstractmethod
     def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
         """The reading, SI, () or (n,), at ``theta`` and the columns ``x``; NumPy and JAX."""
+
+    def unstated_errors(self, symbol: str) -> set[str]:
+        """See ``Experiment``."""
+        errors = [column.instrument.errors if column.instrument else {} for column in self.table.columns.values()]
+        words = {"gain": "gain", "offset": "zero"}
+        return {word for error, word in words.items() if not all(error in stated for stated in errors)}
+
+    def instrument(self, column: str, theta: ValuesBySymbol) -> tuple[Any, Any]:
+        """Factor and offset, SI, of ``readings`` of a column over the truth at ``theta``: the stated errors are taken off."""
+        gain, offset = (str(Name(symbol, dict(self.instruments).get(column, ""))) for symbol in INSTRUMENT_ERRORS)
+        stated = 1.0 + self.stated_errors.get(gain, 0.0), self.stated_errors.get(offset, 0.0)
+        # A fit of one table has no errors of instruments in theta.
+        return (1.0 + theta.get(gain, stated[0] - 1.0)) / stated[0], (
+            theta.get(offset, stated[1]) - stated[1]
+        ) / stated[0]
+
+    def true(self, column: str, values: Any, theta: ValuesBySymbol) -> Any:
+        """What a column would read without the errors of its instrument at ``theta``."""
+        factor, offset = self.instrument(column, theta)
+        return (values - offset) / factor
+
+    def shown(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        """What its instrument reads where the reading is as predicted at the readings ``x`` of the other columns."""
+        if not self.instruments:
+            return self.predict(theta, x)
+        factor, offset = self.instrument(self.reading, theta)
+        return offset + factor * self.predict(
+            theta, {name: self.true(name, values, theta) for name, values in x.items()}
+        )
 
     def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
         """Derivative of the prediction by each column of ``uncertain``, by name; () or (n,)."""
@@ -111,7 +147,7 @@ class PointTest(GroundExperiment):
         return (self.scatter.symbol,)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
-        raw = self.observed - xp.asarray(self.predict(theta, self.readings))
+        raw = self.observed - xp.asarray(self.shown(theta, self.readings))
         carried = ((slope * self.sds[name]) ** 2 for name, slope in self.slopes(theta).items())
         variance = sum(carried, self.sds[self.reading] ** 2)
         return (Misfit(raw, variance, self.change(theta), self.design(self.n, xp)),)
@@ -131,7 +167,7 @@ class PointTest(GroundExperiment):
 
         def curve(values: ValuesBySymbol) -> np.ndarray:
             nuisances = self.design(CURVE, np) @ self.nuisance_mean(values)
-            return (np.asarray(self.predict(values, {**held, column.name: along})) + nuisances) * y.to_display
+            return (np.asarray(self.shown(values, {**held, column.name: along})) + nuisances) * y.to_display
 
         lower, upper = band(np.array([curve(draw) for draw in draws]))
         return Comparison(
@@ -152,6 +188,17 @@ class PointTest(GroundExperiment):
             x * column.to_display,
             self.residuals(theta, np)[: self.n],
         )
+
+
+def instrument_parameters(table: Table) -> tuple[Parameter, ...]:
+    """Parameters for the errors of the instruments of a table of which an sd is stated, with normal priors."""
+    rows: dict[str, Parameter] = {}
+    for one in (column.instrument for column in table.columns.values() if column.instrument is not None):
+        for symbol, stated in one.errors.items():
+            if stated.sd:
+                row = parameter(symbol, one.name, Prior("normal", stated.value, stated.sd))
+                rows[row.name] = replace(row, unit=one.unit) if symbol == "offset" else row
+    return tuple(rows.values())
 
 
 @jax.jit

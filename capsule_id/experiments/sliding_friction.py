@@ -75,6 +75,7 @@ KIND = Kind(
     masses=masses_of_pulls,
     masses_of_free=MASSES_OF_FREE,
     parameters=(SLIDING_SCATTER,),
+    has_instruments=True,
     make=made_by("capsule_id.experiments.sliding_friction:SlidingFriction"),
     template=TEMPLATE,
     informs="mu, v_s",

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
 
+import equinox as eqx
 import numpy as np
 
 from capsule_id.experiments.base import Start, ValuesBySymbol
@@ -135,6 +136,7 @@ KIND = Kind(
     meant=("break-away", "sliding", "no pull"),
     rules=(check_normal_force, _check_tilt, _check_ground, check_load),
     parameters=(TILT_SD, PULL_SCATTER),
+    has_instruments=True,
     make=made_by("capsule_id.experiments.static_friction:StaticFriction"),
     template=TEMPLATE,
     informs="mu",
@@ -160,6 +162,8 @@ class StaticFriction(FrictionExperiment):
     the tilted board (sin = height/length) or the base (tan = height/length).
     """
 
+    side: Literal["board", "base"] | None = eqx.field(static=True)
+
     role, reading, scatter, relative, on_track = "static", "angle", TILT_SD, False, False
 
     @classmethod
@@ -169,15 +173,28 @@ class StaticFriction(FrictionExperiment):
 
     def read(self, table: Table) -> tuple[dict[str, Any], dict[str, Any]]:
         """Angle, (n,) rad, and its reading error, () or (n,) rad."""
-        values, sds = super().read(table)
-        if "angle" in values:
+        (values, sds), self.side = super().read(table), None if "angle" in table.columns else table.settings.length_is
+        if self.side is None:
             return values, sds
         height, length = values["height"], values["length"]
         ratio = height / length
         ratio_sd = ratio * np.hypot(sds["height"] / height, sds["length"] / length)
-        if table.settings.length_is == "board":
-            return {"angle": np.arcsin(ratio)}, {"angle": ratio_sd / np.sqrt(1.0 - ratio**2)}
-        return {"angle": np.arctan(ratio)}, {"angle": ratio_sd / (1.0 + ratio**2)}
+        per_ratio = 1.0 / np.sqrt(1.0 - ratio**2) if self.side == "board" else 1.0 / (1.0 + ratio**2)
+        return {"angle": self._angle(ratio), "length": length}, {"angle": ratio_sd * per_ratio}
+
+    def _angle(self, ratio: Any) -> Any:
+        """The angle, rad, of a height over a length."""
+        xp = array_module(ratio)
+        return xp.arcsin(ratio) if self.side == "board" else xp.arctan(ratio)
+
+    def shown(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        """The angle of the height and the length that their instruments read."""
+        if self.side is None or not self.instruments:
+            return super().shown(theta, x)
+        angle = self.predict(theta, x)
+        xp, (factor, offset) = array_module(angle), self.instrument("height", theta)
+        height = self.true("length", x["length"], theta) * (xp.sin(angle) if self.side == "board" else xp.tan(angle))
+        return self._angle((offset + factor * height) / x["length"])
 
     def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
         tangent = self.friction.coefficient(theta).forward(0.0)

@@ -92,6 +92,7 @@ KIND = Kind(
     sets=(("deflection", "force"),),
     settings=SpringSettings,
     rules=(refuse_idle_sd_ratio,),
+    has_instruments=True,
     make=made_by("capsule_id.experiments.support_spring:SupportSpring"),
     template=TEMPLATE,
     informs="k2 of that spring",

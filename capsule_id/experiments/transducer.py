@@ -45,6 +45,7 @@ KIND = Kind(
     settings=TransducerSettings,
     rules=(refuse_idle_sd_ratio,),
     parameters=(SENSITIVITY,),
+    has_instruments=True,
     make=made_by("capsule_id.experiments.transducer:Transducer"),
     template=TEMPLATE,
     informs="sensitivity of that transducer",

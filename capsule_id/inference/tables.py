@@ -17,7 +17,7 @@ from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target import LogPosterior
-from capsule_id.parameters import Parameter, parameter
+from capsule_id.parameters import INSTRUMENT_WORDS, Parameter, is_stated, parameter
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.views import Finding, ResultTable
 
@@ -176,7 +176,7 @@ def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
 SUMMARY_COLUMNS = (
     "unit", "meaning", "value", "sd", "quote", "basis", "trust", "paper", "map", "standard_error", "mean", "median", "lower",
     "upper", "ess", "ess_bulk", "ess_tail", "rhat", "informed", "widening", "sd_unwidened", "lower_unwidened",
-    "upper_unwidened",
+    "upper_unwidened", "not_in_sd",
 )  # fmt: skip
 #: Ratio of the arms of a 95 % interval about the median above which value ± sd does not describe it. A log-normal
 #: distribution has it at a relative sd of 0.35.
@@ -211,6 +211,7 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             "map": point.values[row.name],
             "standard_error": at_point[row.name],
             "informed": bool(known[i]),
+            "not_in_sd": " ".join(unstated_errors(target, row)),
         }
         if posterior is not None:
             draws = posterior.draws[..., i].ravel()
@@ -230,7 +231,8 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             "quote": "sd",
             "trust": "not judged" if posterior is None else "trusted",
         }
-        entry = {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, **exact, **errors, **said}
+        said |= {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, "not_in_sd": ""}
+        entry = {**exact, **errors, **said}
         rows.append((row, entry))
     physical, nuisances = (
         pd.DataFrame.from_dict({row.name: entry for row, entry in rows if row.physical == chosen}, orient="index")
@@ -239,6 +241,14 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
         for chosen in (True, False)
     )
     return physical, nuisances
+
+
+def unstated_errors(target: LogPosterior, row: Parameter) -> list[str]:
+    """Errors of instruments that move a physical parameter and that its sd does not contain."""
+    measured = row.physical and not is_stated(row.name)
+    own = [e for e in target.experiments if measured and any(other.name == row.name for other in e.parameters)]
+    found = {word for e in own for word in e.unstated_errors(row.symbol)}
+    return [word for word in INSTRUMENT_WORDS if word in found]
 
 
 def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, float]:

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.inference.result import Posterior, Result
-from capsule_id.parameters import is_stated, symbol_of
+from capsule_id.parameters import INSTRUMENT_WORDS, is_stated, symbol_of
 from capsule_id.views import Level, Trust, after_number, counted
 
 # typography: How numbers, units and parameter names are set: one rule each, for every table and figure.
@@ -207,6 +207,18 @@ def skewed_names(frame: pd.DataFrame) -> list[str]:
     return [row.name for row in table_rows(frame) if row.skewed]
 
 
+def errors_left_out(frame: pd.DataFrame) -> list[str]:
+    """A sentence about the errors of instruments that no sd of ``frame`` contains; [] where all are stated."""
+    missing = {str(name): str(words).split() for name, words in frame["not_in_sd"].items()}
+    names = {word: [name for name, own in missing.items() if word in own] for word in INSTRUMENT_WORDS}
+    found = [word for word in INSTRUMENT_WORDS if names[word]]
+    if not found:
+        return []
+    parts = "; ".join(f"{word}: {', '.join(names[word])}" for word in found)
+    words = " or ".join(filter(None, [", ".join(found[:-1]), found[-1]]))
+    return [f"the sd contains no error of {words} ({parts}); an [[instrument]] in rig.toml states them"]
+
+
 def _ends(values: Mapping[Hashable, Any], suffix: str = "") -> list[float] | None:
     ends = [float(values[f"lower{suffix}"]), float(values[f"upper{suffix}"])]
     return ends if np.all(np.isfinite(ends)) else None
@@ -283,6 +295,7 @@ COLUMNS = (
     OutputColumn("ess_tail", outputs=FILES),
     OutputColumn("rhat", "R-hat", lambda row: fixed(float(row.values["rhat"]), 3), sampled=True),
     OutputColumn("informed", "informed", _informed, sampled=True, numeric=False),
+    OutputColumn("not_in_sd", value=lambda values: str(values["not_in_sd"]).split(), outputs=frozenset({"json"})),
     OutputColumn("quoted", "to copy", lambda row: row.concise, outputs=frozenset({"html"})),
 )  # fmt: skip
 

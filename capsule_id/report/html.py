@@ -26,6 +26,7 @@ from capsule_id.report.columns import (
     MISSING,
     Row,
     SampledParameters,
+    errors_left_out,
     fixed,
     printed_table,
     sampled_parameters,
@@ -238,6 +239,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
             answers=[(row, _truth(row, result.truth.get(row.name))) for row in stated_last],
             steps=next_steps(result),
             skewed=skewed_names(result.summary),
+            left_out=errors_left_out(result.summary),
             experiments=_experiments(result, [picture for picture in pictures if picture.section == "measured"]),
             sections={name: [picture for picture in narrow_first if picture.section == name] for name in _WHOLE_FIT},
             parameters=printed_table(result.summary, "html"),
@@ -516,4 +518,6 @@ def latex_table(result: Result) -> str:
         number = re.sub(r"[-+.e\d]*\d", r"$\g<0>$", number) if row.skewed else f"${number}$".replace("±", r"\pm")
         unit = row.unit.replace("µ", r"\textmu ").replace("²", "$^2$").replace("^2", "$^2$")
         lines.append(rf"{symbol}{f' ({label})' if label else ''} & {unit} & {number} & {row.values['trust']} \\")
-    return "\n".join([*lines, r"\end{tabular}"])
+    texts = (text.translate(_ESCAPES) for text in errors_left_out(result.summary))
+    notes = [rf"\multicolumn{{4}}{{p{{0.9\linewidth}}}}{{{text}}} \\" for text in texts]
+    return "\n".join([*lines, *notes, r"\end{tabular}"])

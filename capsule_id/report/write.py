@@ -28,7 +28,7 @@ from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.output import as_utf8, write_file
 from capsule_id.parameters import TABLE
-from capsule_id.report.columns import columns_of
+from capsule_id.report.columns import columns_of, errors_left_out
 from capsule_id.report.figures.style import own_style
 from capsule_id.report.html import pictures, render
 from capsule_id.report.messages import finding_text, messages_of, title_of
@@ -81,6 +81,7 @@ def parameters_json(result: Result) -> dict[str, object]:
         "rig": result.rig.name,
         "synthetic": result.rig.synthetic,
         "trust": result.trust,
+        "not_in_sd": errors_left_out(result.summary),
         "parameters": {
             str(name): {column.key: _plain(column.of(row)) for column in columns}
             for name, row in result.summary.to_dict("index").items()

@@ -37,7 +37,10 @@ def on_reference(node: Node, raw: RawTable) -> tuple[RawTable, Quantity]:
     InputError
         At the key or value of the clock that is wrong, or if the table has no times.
     """
-    node.table(_CLOCK_EXAMPLE, tuple(_CLOCK))
+    node.table(_CLOCK_EXAMPLE)
+    if "value" in node:  # of an instrument: the drift alone
+        node = replace(node, value={"drift": node.value})
+    node.refuse_unknown(tuple(_CLOCK))
     if not node.value:
         raise node.error("a clock must have an offset or a drift", "none", f"write {_CLOCK_EXAMPLE}")
     stated = read_rules(node, _CLOCK)

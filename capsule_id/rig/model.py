@@ -48,6 +48,25 @@ class ModelChoices:
 
 
 @dataclass(frozen=True)
+class Instrument:
+    """What a column was read with: reading = (1 + gain) truth + offset, SI; None: not stated.
+
+    Columns of one instrument share its errors. ``unit`` is that of the offset. A clock states the ``drift`` of its table.
+    """
+
+    name: str
+    unit: str = "1"
+    gain: Quantity | None = None
+    offset: Quantity | None = None
+
+    @property
+    def errors(self) -> dict[str, Quantity]:
+        """The stated errors, by symbol."""
+        pairs = (("gain", self.gain), ("offset", self.offset))
+        return {symbol: stated for symbol, stated in pairs if stated is not None}
+
+
+@dataclass(frozen=True)
 class Column:
     """One column of a table.
 
@@ -56,9 +75,10 @@ class Column:
     name : the column's name in the file, e.g. ``x_rel``
     unit : the unit written in the file, e.g. ``mm`` (only for display)
     to_display : multiply SI by this to get the file's unit
-    values : (n,) SI, read-only
+    values : (n,) SI, read-only, without the stated gain and offset of its instrument
     sd : stated reading error, SI (None: not stated)
     resolution : stated reading step, SI (None: not stated)
+    instrument : what it was read with (None: not stated)
     """
 
     name: str
@@ -67,6 +87,7 @@ class Column:
     values: np.ndarray
     sd: float | None = None
     resolution: float | None = None
+    instrument: Instrument | None = None
 
     @property
     def reading_sd(self) -> float:

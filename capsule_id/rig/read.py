@@ -23,9 +23,10 @@ from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
 from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError
 from capsule_id.rig.guess import find_layout, proposal
 from capsule_id.rig.maps import MAP_KEYS, apply_map, on_reference, read_map
-from capsule_id.rig.model import NO_DRIFT, Column, Quantity, Rig, Settings, Table
+from capsule_id.rig.model import NO_DRIFT, Column, Instrument, Quantity, Rig, Settings, Table
 from capsule_id.rig.plateaus import read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import (
+    INSTRUMENT_KEYS,
     RIG_QUANTITIES,
     TABLE_KEYS,
     ColumnRule,
@@ -39,7 +40,7 @@ from capsule_id.rig.schema import (
     read_model,
     read_rules,
 )
-from capsule_id.rig.toml import LARGEST, NAME_PATTERN, SMALLEST, Node, closest, is_plausible, parse_toml, shown
+from capsule_id.rig.toml import ANY, LARGEST, NAME_PATTERN, SMALLEST, Node, closest, is_plausible, parse_toml, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 from capsule_id.views import counted
 
@@ -47,7 +48,9 @@ from capsule_id.views import counted
 
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
-_READING_ERRORS = ("_sd", "_resolution")
+_READING_ERRORS = ("_sd", "_resolution", "_instrument")
+#: Largest gain of an instrument and its sd: a gain of 0.01 reads 1 % too much.
+LARGEST_GAIN = 0.5
 #: Smallest stated reading error relative to the largest reading; below it rounding exceeds the error.
 SMALLEST_RELATIVE_ERROR = 1e-12
 
@@ -73,7 +76,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         [rig] or experiments have faults, at the first one of each (``FolderError``).
     """
     root, sha256 = _read_document(Path(folder))
-    root.refuse_unknown(("rig", "model", "prior", "experiment"))
+    root.refuse_unknown(("rig", "model", "prior", "instrument", "experiment"))
     if "rig" not in root:
         place = root.document.path, 1, 1
         raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", *place)
@@ -90,8 +93,15 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
             with collecting(faults):
                 stated[key] = head[key].quantity(rule.si, rule.domain, rule.has_sd)
     ground = {key: stated[key] for key in ("slope", "N0") if key in stated}
+    instruments = _instruments(root)
     tables, files = _read_experiments(root, kinds, ground, faults)
     raise_all(faults)
+    for instrument in {*instruments} - {c.instrument.name for t in tables for c in t.columns.values() if c.instrument}:
+        rule, remedy = (
+            "an instrument must have read a column",
+            f'write <column>_instrument = "{instrument}" in an experiment',
+        )
+        raise instruments[instrument].error(rule, "none", remedy)
     model = read_model(root)
     check_masses(root, model, tables, kinds, set(stated))
     check_engine(root, model, tables)
@@ -237,7 +247,10 @@ def _read_experiment(
             raise entry[key].error(
                 f"{key} needs a column {column}", f"columns {' '.join(table.columns)}", "remove it", of_key=True
             )
-    columns = {key: _with_reading_error(entry, column, kind) for key, column in table.columns.items()}
+    columns = {
+        key: _with_instrument(entry, _with_reading_error(entry, column, kind), kind)
+        for key, column in table.columns.items()
+    }
     table = replace(table, columns=MappingProxyType(columns))
     for rule in kind.rules:
         rule(Entry(table, entry, raw))
@@ -248,7 +261,7 @@ def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
     """The column with its stated sd and resolution."""
     smallest = SMALLEST_RELATIVE_ERROR * max(np.max(column.values), -np.min(column.values))
     stated: list[float | None] = []
-    for key in (column.name + suffix for suffix in _READING_ERRORS):
+    for key in (f"{column.name}_sd", f"{column.name}_resolution"):
         size = entry[key].quantity(kind.columns[column.name].si).value if key in entry else None
         if size is not None and size < smallest:
             raise entry[key].error(
@@ -258,6 +271,85 @@ def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
             )
         stated.append(size)
     return replace(column, sd=stated[0], resolution=stated[1])
+
+
+# instruments: ``[[instrument]]``, its clock, and the columns that it read.
+
+
+def _instruments(root: Node) -> dict[str, Node]:
+    """The instruments of a rig, by name."""
+    entries = root.get("instrument", [])
+    entries.require(isinstance(entries.value, list), "be a list of tables", "write [[instrument]]")
+    found: dict[str, Node] = {}
+    for index in range(len(entries.value)):
+        node = entries[index].table("[[instrument]]", INSTRUMENT_KEYS)
+        name = node["name"].name() if "name" in node else ""
+        if not name or name in found or len(node.value) == 1:
+            rule = "an instrument must have a name of its own, and a gain, an offset or a clock"
+            raise node.error(rule, shown(node.value), "correct it, or remove it")
+        found[name] = node
+    return found
+
+
+def _instrument_of(entry: Node, column: str) -> Node | None:
+    """The instrument that read ``column`` in an experiment."""
+    key = f"{column}_instrument"
+    if key not in entry:
+        return None
+    known, name = _instruments(Node(entry.document, (), entry.document.data)), entry[key].text()
+    if name not in known:
+        near = closest(name, known)
+        remedy = f'write "{near}"' if near else f'add [[instrument]] with name = "{name}"'
+        raise entry[key].error("an experiment must name an instrument of rig.toml", shown(name), remedy)
+    return known[name]
+
+
+def _clock_of(entry: Node) -> Node | None:
+    """The clock of the instrument that read the times of an experiment."""
+    instrument = _instrument_of(entry, "time")
+    if instrument is None:
+        return None
+    if "clock" in entry or "clock" not in instrument:
+        key = entry["clock" if "clock" in entry else "time_instrument"]
+        rule = "a clock is stated once, by the experiment or by the instrument of its times"
+        value, remedy = ("both", "remove clock") if "clock" in entry else ("none", "give the instrument a clock")
+        raise key.error(rule, value, remedy, of_key=True)
+    return _error_of(instrument, "clock", "1")
+
+
+def _error_of(instrument: Node, key: str, si: str) -> Node:
+    """An error of an instrument; without a value it is 0."""
+    stated = instrument[key].table(f'{{ value = ..., sd = ..., unit = "{si}" }}')
+    return replace(stated, value={"value": 0.0, **stated.value})
+
+
+def _with_instrument(entry: Node, column: Column, kind: KindRule) -> Column:
+    """The column without the stated errors of the instrument that read it."""
+    node = _instrument_of(entry, column.name)
+    if node is None or column.name == "time":
+        return column if node is None else replace(column, instrument=Instrument(node["name"].value))
+    place, rule = entry[f"{column.name}_instrument"], kind.columns[column.name]
+    if not kind.has_instruments:
+        gain_sd = f"{column.name}_gain_sd"
+        remedy = f"state {gain_sd} in its place" if gain_sd in kind.setting_rules else "remove it"
+        raise place.error(f"{kind.name} takes an instrument of time alone", shown(place.value), remedy, of_key=True)
+    stated: dict[str, Quantity] = {}
+    for symbol, si in (("gain", "1"), ("offset", rule.si)):
+        if symbol in node:
+            stated[symbol] = _error_of(node, symbol, si).quantity(si, ANY, has_sd=True)
+    if not stated:
+        raise place.error(f"the instrument of {column.name} must have a gain or an offset", "none", "state one")
+    instrument = Instrument(node["name"].value, rule.si, **stated)
+    gain, offset = (instrument.errors.get(symbol, Quantity(0.0)) for symbol in ("gain", "offset"))
+    if max(abs(gain.value), gain.sd) > LARGEST_GAIN:
+        rule_of_gain = f"a gain is a relative error, at most {LARGEST_GAIN:g}"
+        raise node["gain"].error(rule_of_gain, f"{gain.value:g} ± {gain.sd:g}", "write 0.01 for readings 1 % too large")
+    values = (column.values - offset.value) / (1.0 + gain.value)
+    if not rule.domain.holds(values).all():
+        reached = f"{np.min(values) * column.to_display:g} {column.unit}"
+        raise node.error(f"{column.name} without its errors must {rule.domain.text}", reached, "correct value or unit")
+    values.flags.writeable = False
+    return replace(column, values=values, instrument=instrument)
 
 
 # order: Finds why the times of a table do not increase, and the remedy that cures this cause.
@@ -385,6 +477,8 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
     drift = NO_DRIFT
     if "clock" in entry:
         raw, drift = on_reference(entry["clock"], raw)
+    if (clock := _clock_of(entry)) is not None:
+        raw, drift = on_reference(clock, raw)
     if "reject" in entry:
         raw = without_outliers(entry["reject"], raw, _times)
     if plateaus is not None:

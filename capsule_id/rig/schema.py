@@ -243,6 +243,7 @@ class KindRule:
     meant : words of ``capsule_id.rig.guess`` for the forces of the file: the one that the kind takes, then others
     parameters : rows of the parameters that only experiments of this kind have
     bench : a bench test; else a forced run
+    has_instruments : gain and offset of an instrument act on its columns
     """
 
     name: str
@@ -257,6 +258,7 @@ class KindRule:
     meant: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     bench: bool = True
+    has_instruments: bool = False
 
     @cached_property
     def setting_rules(self) -> Mapping[str, SettingRule]:
@@ -327,6 +329,7 @@ TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
     "[rig]": ("name", "synthetic", "confirmed", *RIG_QUANTITIES),
     "[model]": ("friction", "free", "reaction", "engine"),
 }
+INSTRUMENT_KEYS = ("name", "gain", "offset", "clock")
 
 
 # choices: Reads ``[model]`` of ``rig.toml``, and checks choices of [rig] and of an experiment that depend on each

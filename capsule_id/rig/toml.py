@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import count
-from math import inf, isfinite, pi
+from math import inf, isfinite, pi, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -230,6 +230,8 @@ _DEVICE = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECAS
 LARGEST_NUMBER = sys.float_info.max
 #: Units of masses and lengths. Positive ones are weighed or measured to better than half of their value.
 WEIGHED = ("kg", "m", "m/s^2")
+#: Keys of the error of a quantity: its sd, half the width of a rectangle, or an expanded error with its factor k.
+ERRORS = ("sd", "half_width", "expanded", "k")
 _LONGEST_SHOWN = 60  # characters of a faulty value in an error line
 #: Other names of keys and words of ``rig.toml``.
 _ALIASES = {
@@ -379,13 +381,27 @@ class Node:
     def quantity(self, si: str, domain: Domain = POSITIVE, has_sd: bool = False) -> Quantity:
         """``{ value = ..., sd = ..., unit = "..." }`` in SI; ``sd`` is refused unless ``has_sd``."""
         example = f'{{ value = ..., {"sd = ..., " if has_sd else ""}unit = "{si}" }}'
-        factor = self.table(example, ("value", "sd", "unit") if has_sd else ("value", "unit")).unit(si)
+        factor = self.table(example, ("value", *(ERRORS if has_sd else ()), "unit")).unit(si)
         number = self._scaled("value", factor, domain)
-        sd = self._scaled("sd", factor, NOT_NEGATIVE) if "sd" in self else 0.0
-        if si in WEIGHED and domain is POSITIVE and sd > 0.5 * number:
-            rule, stated = f"sd of {self.key} must be at most half of its value", self["sd"]
+        error = self._error(factor) if has_sd else None
+        if error and si in WEIGHED and domain is POSITIVE and error[1] > 0.5 * number:
+            rule, stated = f"sd of {self.key} must be at most half of its value", self[error[0]]
             raise stated.error(rule, shown(stated.value), "weigh or measure it, or leave it out")
-        return Quantity(number, sd)
+        return Quantity(number, error[1] if error else 0.0)
+
+    def _error(self, factor: float) -> tuple[str, float] | None:
+        """The key that states an error, and its sd, SI: an expanded error is k sds, half the width of a rectangle is
+        sqrt(3) sds (JCGM 100:2008, 4.3.3 and 4.3.7); None: no error is stated.
+        """
+        words = [word for word in ("sd", "half_width", "expanded") if word in self]
+        if words[1:]:
+            raise self[words[1]].error("state an error once", " and ".join(words), f"remove {words[1]}", of_key=True)
+        if "k" in self and words != ["expanded"]:
+            raise self["k"].error("k belongs to an expanded error", "no expanded", "add expanded = ...", of_key=True)
+        if not words:
+            return None
+        sds = {"sd": 1.0, "half_width": sqrt(3.0)}.get(words[0]) or self._scaled("k", 1.0, POSITIVE)
+        return words[0], self._scaled(words[0], factor, NOT_NEGATIVE) / sds
 
     def prior(self, si: str, default: Prior) -> Prior:
         """``{ median, factor, unit }``, ``{ scale, unit }`` or ``{ mean, sd, unit }``, by the kind of the default prior.

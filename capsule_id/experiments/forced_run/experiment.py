@@ -229,6 +229,11 @@ class CapsuleRun(CapsuleForward):
         rows += [NOISE[name].named(whole, prior) for name, prior in zip(self.names, sds, strict=True)]
         return [*rows, *(CORRELATION[name].named(whole) for name in self.names if self.coloured)]
 
+    def unstated_errors(self, symbol: str) -> set[str]:
+        """The offsets of all channels are free."""
+        gains = all(channel.gain_sd is not None for channel in self.channels)
+        return super().unstated_errors(symbol) | (set() if gains else {"gain"})
+
     def starts(self) -> dict[str, Start]:
         """Starts of the nuisances from the record, sampled or not; other parameters start at bench estimates or priors."""
         rough, of, settings = self.rough, self.about.record, self.table.settings

@@ -55,6 +55,7 @@ from capsule_id.experiments.free_vibration.models import (
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
     CHOICES,
+    FURTHER,
     Blocks,
     Channel,
     DecayModel,
@@ -242,6 +243,10 @@ class Decay(SurfaceExperiment):
     def with_model(self, model: DecayModel, screened: Screened | None = None, table: Table | None = None) -> Self:
         """Return the same readings, or other ones, with a model; its fit ``screened`` gives the starting point."""
         return type(self)(table or self.table, self.rig, self.friction, model, screened)  # type: ignore[call-arg]  # pyright: ignore
+
+    def unstated_errors(self, symbol: str) -> set[str]:
+        """A gain changes the further forces alone: amplitude and zero are free."""
+        return super().unstated_errors(symbol) | ({"gain"} if symbol in FURTHER else set())
 
     @property
     @abstractmethod

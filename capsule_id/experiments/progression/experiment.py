@@ -258,6 +258,9 @@ class Progression(CapsuleForward):
     def observed(self) -> np.ndarray:
         return self.distance
 
+    def unstated_errors(self, symbol: str) -> set[str]:
+        return {"gain", "zero"}
+
     @property
     def scaled_by(self) -> dict[str, tuple[str, ...]]:
         return {"session_sd": tuple(f"{symbol}[{self.label}]" for symbol in self.sessions.symbols)}

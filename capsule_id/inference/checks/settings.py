@@ -40,8 +40,8 @@ class Outlier:
 
 
 def moving_symbols(experiment: Experiment) -> list[str]:
-    """Symbols of the parameters that change the experiment's prediction (scatters do not)."""
-    return [row.symbol for row in experiment.parameters if not row.scatter]
+    """Keys of the parameters that change the experiment's prediction (scatters do not)."""
+    return [row.key for row in experiment.parameters if not row.scatter]
 
 
 def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray]:
