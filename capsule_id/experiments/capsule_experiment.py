@@ -81,6 +81,7 @@ class CapsuleForward(GroundExperiment):
     def set_model(self, table: Table, rig: Rig, friction: FrictionModel) -> None:
         """Set friction law, ground, engine and reaction, as [model] and the table state them."""
         self.friction, self.ground = friction, ground_of(table)
+        self.read_instruments(table)
         self.smoothing = Smoothing() if rig.model.engine == "smooth" else None
         self.reaction = rig.model.share_of_reaction
 
@@ -169,6 +170,10 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         times = jnp.multiply.outer(stretch(self.clock_rate, theta), self.time)
         t = self.simulated(theta, p, OFF, times, initial)
         return self.values - xp.asarray(t.X1 - t.X2), self.width * xp.ones((self.n, 1))
+
+    def unstated_errors(self, symbol: str) -> set[str]:
+        """Its friction forces do not grow with the amplitude, so that a gain moves every parameter."""
+        return super().unstated_errors(symbol) | {"gain"}
 
     def starts(self) -> dict[str, Start]:
         starts = super().starts() | starts_of_motion(self, self.rough)

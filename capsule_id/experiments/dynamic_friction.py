@@ -23,7 +23,7 @@ from capsule_id.experiments.friction import (
 )
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors
-from capsule_id.parameters import Prior, scatter
+from capsule_id.parameters import INSTRUMENT_ERRORS, Prior, scatter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.friction import FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
@@ -113,15 +113,9 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
 
 
 def _check_ground(entry: Entry[PushSettings]) -> None:
-    """Refuse a slope and instruments for the capsule model of a free rod."""
+    """Refuse a slope for the capsule model of a free rod."""
     if entry.table.settings.forward == "capsule":
         entry.refuse_ground("slope", 'pushes with forward = "capsule" must be on level ground')
-        for name, column in entry.table.columns.items():
-            if column.instrument is not None:
-                rule = 'pushes with forward = "capsule" take no instrument'
-                raise entry.error(
-                    f"{name}_instrument", rule, column.instrument.name, 'remove it, or forward = "capsule"'
-                )
 
 
 TEMPLATE = """\
@@ -146,7 +140,7 @@ KIND = Kind(
     rules=(_check_ground,),
     masses_of_free=MASSES_OF_FREE,
     parameters=(PUSH_SCATTER,),
-    has_instruments=True,
+    read_by=INSTRUMENT_ERRORS,
     make=made_by(
         "capsule_id.experiments.dynamic_friction:DynamicFriction",
         capsule="capsule_id.experiments.capsule_experiment:CapsulePushes",

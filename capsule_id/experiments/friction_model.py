@@ -1,7 +1,7 @@
 """Friction law of a fit: its sampled parameters, and the law at given values."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, cast
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.parameters import INSTRUMENT_ERRORS, Name, Parameter, Prior, parameter
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force, scaled
 from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 
@@ -261,6 +261,17 @@ def ground_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
     return tuple(rows)
 
 
+def instrument_parameters(table: Table[Any]) -> tuple[Parameter, ...]:
+    """Parameters for the errors of the instruments of a table of which an sd is stated, with normal priors."""
+    rows: dict[str, Parameter] = {}
+    for one in (column.instrument for column in table.columns.values() if column.instrument is not None):
+        for symbol, stated in one.errors.items():
+            if stated.sd:
+                row = parameter(symbol, one.name, Prior("normal", stated.value, stated.sd))
+                rows[row.name] = replace(row, unit=one.unit) if symbol == "offset" else row
+    return tuple(rows.values())
+
+
 class SurfaceExperiment(Experiment):
     """An experiment with a sliding capsule; its constructor takes a friction law in addition to table and rig.
 
@@ -286,9 +297,28 @@ class GroundExperiment(SurfaceExperiment):
     Attributes
     ----------
     ground : slope, rad, and N0, N, where they are not 0; None: a parameter, because an sd is stated
+    instruments : names of the instruments that read the columns, by column
+    stated_errors : of these instruments, SI, by name (``gain[lvdt]``)
     """
 
     ground: dict[str, float | None]
+    instruments: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    stated_errors: dict[str, float]
+
+    def read_instruments(self, table: Table[Any]) -> None:
+        """Set ``instruments`` and ``stated_errors``."""
+        read_by = {name: column.instrument for name, column in table.columns.items() if column.instrument is not None}
+        self.instruments = tuple((name, one.name) for name, one in read_by.items())
+        self.stated_errors = {str(Name(s, i.name)): q.value for i in read_by.values() for s, q in i.errors.items()}
+
+    def instrument(self, column: str, theta: ValuesBySymbol) -> tuple[Any, Any]:
+        """Factor and offset, SI, of ``readings`` of a column over the truth at ``theta``: the stated errors are taken off."""
+        gain, offset = (str(Name(symbol, dict(self.instruments).get(column, ""))) for symbol in INSTRUMENT_ERRORS)
+        stated = 1.0 + self.stated_errors.get(gain, 0.0), self.stated_errors.get(offset, 0.0)
+        # A fit of one table has no errors of instruments in theta.
+        return (1.0 + theta.get(gain, stated[0] - 1.0)) / stated[0], (
+            theta.get(offset, stated[1]) - stated[1]
+        ) / stated[0]
 
     def ground_at(self, theta: ValuesBySymbol) -> dict[str, Any]:
         """Slope, rad, and N0, N, at ``theta``, where they are not 0."""

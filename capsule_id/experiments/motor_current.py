@@ -7,6 +7,7 @@ import numpy as np
 
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.line import MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
+from capsule_id.parameters import INSTRUMENT_ERRORS
 from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ColumnRule, QuantityRule
 
@@ -61,7 +62,7 @@ KIND = Kind(
     sets=(("force", "current"),),
     settings=MotorSettings,
     rules=(refuse_idle_sd_ratio,),
-    has_instruments=True,
+    read_by=INSTRUMENT_ERRORS,
     make=made_by("capsule_id.experiments.motor_current:MotorCurrent"),
     template=TEMPLATE,
     informs="K",

@@ -23,9 +23,10 @@ from capsule_id.experiments.friction_model import (
     GroundExperiment,
     ground_of,
     ground_parameters,
+    instrument_parameters,
 )
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.parameters import INSTRUMENT_ERRORS, Name, Parameter, Prior, parameter
+from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.rig.schema import GroundSettings
 from capsule_id.views import Comparison, Curve, Points
@@ -44,15 +45,11 @@ class PointTest(GroundExperiment):
     readings : by column, SI: (n,), or () where all rows have one value
     sds : their reading errors, () or (n,), by column
     uncertain : columns other than the reading that have errors
-    instruments : names of the instruments that read the columns, by column
-    stated_errors : of these instruments, SI, by name (``gain[lvdt]``)
     """
 
     readings: dict[str, np.ndarray]
     sds: dict[str, Any]
     uncertain: tuple[str, ...] = eqx.field(static=True)
-    instruments: tuple[tuple[str, str], ...] = eqx.field(static=True)
-    stated_errors: dict[str, float]
 
     #: Column that is predicted.
     reading: ClassVar[str]
@@ -72,9 +69,7 @@ class PointTest(GroundExperiment):
         others = (name for name in self.sds if name != self.reading)
         self.uncertain = tuple(name for name in others if np.any(np.asarray(self.sds[name]) > 0.0))
         ground = ground_parameters(table, rig) if on_track else ()
-        read_by = {name: c.instrument for name, c in table.columns.items() if c.instrument is not None}
-        self.instruments = tuple((name, one.name) for name, one in read_by.items())
-        self.stated_errors = {str(Name(s, i.name)): q.value for i in read_by.values() for s, q in i.errors.items()}
+        self.read_instruments(table)
         self.about = About(table, rig, (*self.own_parameters(table), *ground, *instrument_parameters(table)))
 
     def read(self, table: Table) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -98,15 +93,6 @@ class PointTest(GroundExperiment):
         errors = [column.instrument.errors if column.instrument else {} for column in self.table.columns.values()]
         words = {"gain": "gain", "offset": "zero"}
         return {word for error, word in words.items() if not all(error in stated for stated in errors)}
-
-    def instrument(self, column: str, theta: ValuesBySymbol) -> tuple[Any, Any]:
-        """Factor and offset, SI, of ``readings`` of a column over the truth at ``theta``: the stated errors are taken off."""
-        gain, offset = (str(Name(symbol, dict(self.instruments).get(column, ""))) for symbol in INSTRUMENT_ERRORS)
-        stated = 1.0 + self.stated_errors.get(gain, 0.0), self.stated_errors.get(offset, 0.0)
-        # A fit of one table has no errors of instruments in theta.
-        return (1.0 + theta.get(gain, stated[0] - 1.0)) / stated[0], (
-            theta.get(offset, stated[1]) - stated[1]
-        ) / stated[0]
 
     def true(self, column: str, values: Any, theta: ValuesBySymbol) -> Any:
         """What a column would read without the errors of its instrument at ``theta``."""
@@ -188,17 +174,6 @@ class PointTest(GroundExperiment):
             x * column.to_display,
             self.residuals(theta, np)[: self.n],
         )
-
-
-def instrument_parameters(table: Table) -> tuple[Parameter, ...]:
-    """Parameters for the errors of the instruments of a table of which an sd is stated, with normal priors."""
-    rows: dict[str, Parameter] = {}
-    for one in (column.instrument for column in table.columns.values() if column.instrument is not None):
-        for symbol, stated in one.errors.items():
-            if stated.sd:
-                row = parameter(symbol, one.name, Prior("normal", stated.value, stated.sd))
-                rows[row.name] = replace(row, unit=one.unit) if symbol == "offset" else row
-    return tuple(rows.values())
 
 
 @jax.jit

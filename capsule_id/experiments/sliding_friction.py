@@ -16,7 +16,7 @@ from capsule_id.experiments.friction import (
     masses_of_pulls,
 )
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.parameters import Prior, scatter
+from capsule_id.parameters import INSTRUMENT_ERRORS, Prior, scatter
 from capsule_id.rig.schema import ColumnRule, Entry
 from capsule_id.rig.toml import POSITIVE
 
@@ -75,7 +75,7 @@ KIND = Kind(
     masses=masses_of_pulls,
     masses_of_free=MASSES_OF_FREE,
     parameters=(SLIDING_SCATTER,),
-    has_instruments=True,
+    read_by=INSTRUMENT_ERRORS,
     make=made_by("capsule_id.experiments.sliding_friction:SlidingFriction"),
     template=TEMPLATE,
     informs="mu, v_s",

@@ -26,7 +26,7 @@ from capsule_id.experiments.friction import (
 from capsule_id.experiments.friction_model import FrictionModel
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_rows
-from capsule_id.parameters import Prior, scatter
+from capsule_id.parameters import INSTRUMENT_ERRORS, Prior, scatter
 from capsule_id.physics.batches import array_module
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry, QuantityRule
@@ -136,7 +136,7 @@ KIND = Kind(
     meant=("break-away", "sliding", "no pull"),
     rules=(check_normal_force, _check_tilt, _check_ground, check_load),
     parameters=(TILT_SD, PULL_SCATTER),
-    has_instruments=True,
+    read_by=INSTRUMENT_ERRORS,
     make=made_by("capsule_id.experiments.static_friction:StaticFriction"),
     template=TEMPLATE,
     informs="mu",

@@ -12,7 +12,7 @@ from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.line import MESSAGES as LINE_MESSAGES
 from capsule_id.experiments.line import Line, line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.parameters import Parameter, by_index, parameter
+from capsule_id.parameters import INSTRUMENT_ERRORS, Parameter, by_index, parameter
 from capsule_id.rig.model import Quantity, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Finding, Message
@@ -92,7 +92,7 @@ KIND = Kind(
     sets=(("deflection", "force"),),
     settings=SpringSettings,
     rules=(refuse_idle_sd_ratio,),
-    has_instruments=True,
+    read_by=INSTRUMENT_ERRORS,
     make=made_by("capsule_id.experiments.support_spring:SupportSpring"),
     template=TEMPLATE,
     informs="k2 of that spring",

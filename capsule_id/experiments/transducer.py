@@ -5,7 +5,7 @@ from typing import Annotated
 
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.line import MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.parameters import Parameter, Prior
+from capsule_id.parameters import INSTRUMENT_ERRORS, Parameter, Prior
 from capsule_id.rig.model import Settings, Table
 from capsule_id.rig.schema import ColumnRule, QuantityRule
 
@@ -45,7 +45,7 @@ KIND = Kind(
     settings=TransducerSettings,
     rules=(refuse_idle_sd_ratio,),
     parameters=(SENSITIVITY,),
-    has_instruments=True,
+    read_by=INSTRUMENT_ERRORS,
     make=made_by("capsule_id.experiments.transducer:Transducer"),
     template=TEMPLATE,
     informs="sensitivity of that transducer",

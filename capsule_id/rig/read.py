@@ -328,17 +328,18 @@ def _with_instrument(entry: Node, column: Column, kind: KindRule) -> Column:
     node = _instrument_of(entry, column.name)
     if node is None or column.name == "time":
         return column if node is None else replace(column, instrument=Instrument(node["name"].value))
-    place, rule = entry[f"{column.name}_instrument"], kind.columns[column.name]
-    if not kind.has_instruments:
-        gain_sd = f"{column.name}_gain_sd"
-        remedy = f"state {gain_sd} in its place" if gain_sd in kind.setting_rules else "remove it"
-        raise place.error(f"{kind.name} takes an instrument of time alone", shown(place.value), remedy, of_key=True)
-    stated: dict[str, Quantity] = {}
-    for symbol, si in (("gain", "1"), ("offset", rule.si)):
-        if symbol in node:
-            stated[symbol] = _error_of(node, symbol, si).quantity(si, ANY, has_sd=True)
-    if not stated:
-        raise place.error(f"the instrument of {column.name} must have a gain or an offset", "none", "state one")
+    place, rule, gain_sd = entry[f"{column.name}_instrument"], kind.columns[column.name], f"{column.name}_gain_sd"
+    if gain_sd in entry:
+        raise place.error(
+            "a gain is stated once", f"by {gain_sd} and by an instrument", f"remove {gain_sd}", of_key=True
+        )
+    known = kind.read_by if not kind.channels or gain_sd in kind.setting_rules else ()
+    pairs = [(symbol, si) for symbol, si in (("gain", "1"), ("offset", rule.si)) if symbol in node]
+    if not pairs or any(symbol not in known for symbol, _ in pairs):
+        rule_of_errors = f"of the instrument of {column.name}, {kind.name} reads {' and '.join(known) or 'nothing'}"
+        found = " and ".join(symbol for symbol, _ in pairs) or "neither"
+        raise place.error(rule_of_errors, found, "correct the instrument, or remove the line", of_key=True)
+    stated = {symbol: _error_of(node, symbol, si).quantity(si, ANY, has_sd=True) for symbol, si in pairs}
     instrument = Instrument(node["name"].value, rule.si, **stated)
     gain, offset = (instrument.errors.get(symbol, Quantity(0.0)) for symbol in ("gain", "offset"))
     if max(abs(gain.value), gain.sd) > LARGEST_GAIN:

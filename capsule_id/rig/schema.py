@@ -243,7 +243,7 @@ class KindRule:
     meant : words of ``capsule_id.rig.guess`` for the forces of the file: the one that the kind takes, then others
     parameters : rows of the parameters that only experiments of this kind have
     bench : a bench test; else a forced run
-    has_instruments : gain and offset of an instrument act on its columns
+    read_by : what may be stated of the instruments of its columns, besides a clock: gain and offset
     """
 
     name: str
@@ -258,7 +258,7 @@ class KindRule:
     meant: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     bench: bool = True
-    has_instruments: bool = False
+    read_by: tuple[str, ...] = ()
 
     @cached_property
     def setting_rules(self) -> Mapping[str, SettingRule]:

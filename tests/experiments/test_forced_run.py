@@ -1,5 +1,7 @@
 """A forced run: its likelihood against SciPy's densities, its start, its kinds of initial state."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,8 +11,9 @@ from capsule_id.experiments.forced_run.declaration import SETTLING_PERIODS
 from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.start_state import rough_start
 from capsule_id.inference.target import LogPosterior
+from capsule_id.parameters import Prior
 from capsule_id.physics.simulation import simulate
-from capsule_id.rig.model import Quantity
+from capsule_id.rig.model import Instrument, Quantity
 from tests.experiments import bench
 from tests.forced_runs import NOISE, SAMPLES, channels, make, recorded, table, theta
 from tests.inference.stub import log_likelihood
@@ -47,6 +50,22 @@ def test_a_gain_is_integrated_out_where_it_is_asked_for() -> None:
     assert float(
         make(0, start="moving", without=("acceleration_rod", "x_capsule")).log_likelihood(theta(0), np)
     ) != pytest.approx(sum(parts), rel=1e-6)
+
+
+def test_the_gain_of_an_instrument_is_a_parameter_of_the_fit() -> None:
+    own = table(0, start="moving", without=("acceleration_rod", "x_capsule"))
+    lvdt = Instrument("lvdt", "m", Quantity(0.02, 0.01))
+    own = replace(own, columns={**own.columns, "x_rel": replace(own.columns["x_rel"], instrument=lvdt)})
+    run, values = ForcedRun(own, bench.rig(own)), {**theta(0), "gain[lvdt]": 0.05}
+    assert [row.prior for row in run.parameters if row.name == "gain[lvdt]"] == [Prior("normal", 0.02, 0.01)]
+    # The readings are without the stated gain of 0.02.
+    seen, noise = [channels(0)[0] * 1.05 / 1.02, channels(0)[3]], (NOISE["noise_x_rel"], NOISE["noise_current"])
+    observed = [recorded()[0].channels[name][:SAMPLES] for name in ("x_rel", "current")]
+    parts = [density(y, s, sd**2 * np.eye(SAMPLES)) for y, s, sd in zip(observed, seen, noise, strict=True)]
+    assert float(run.log_likelihood(values, np)) == pytest.approx(
+        sum(parts), rel=1e-7
+    )  # residuals of a noise sd magnify rounding
+    assert run.unstated_errors("k1") == {"clock", "gain"}
 
 
 def test_coloured_noise_is_a_stationary_first_order_process() -> None:

@@ -194,7 +194,11 @@ REFUSED = (
     ('name = "cell"\ngain = { expanded = 1, unit = "%" }', "", "add k = ..."),
     ('name = "cell"\noffset = { sd = 1, unit = "mm" }', "", "N"),
     ('name = "cell"', "", "an instrument must have a name of its own, and a gain, an offset or a clock"),
-    ('name = "cell"\nclock = { sd = 1, unit = "ppm" }', "", "the instrument of force must have a gain or an offset"),
+    (
+        'name = "cell"\nclock = { sd = 1, unit = "ppm" }',
+        "",
+        "motor_current reads gain and offset, neither",
+    ),
 )
 
 
@@ -219,5 +223,5 @@ def test_a_channel_takes_the_clock_alone(tmp_path: Path) -> None:
     folder = write_folder(
         tmp_path / "a", text + 'file = "d.csv"\nx_rel_instrument = "a"\n', {"d.csv": decay(np.arange(100) / 400.0, 0)}
     )
-    with pytest.raises(InputError, match="free_vibration takes an instrument of time alone"):
+    with pytest.raises(InputError, match="of the instrument of x_rel, free_vibration reads nothing, gain"):
         cid.read_rig(folder)

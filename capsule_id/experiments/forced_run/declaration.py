@@ -515,6 +515,7 @@ KIND = Kind(
     rules=(Entry.check_spring_with_gap, Entry.check_length, partial(check_drive, DRIVE_RULES)),
     masses=lambda table: ("m2",) if table.settings.drive == "base" else ("m1", "m2"),  # a prescribed rod needs no mass
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
+    read_by=("gain",),
     make=lambda table, *rig: made_by(f"{PLACE}.drives:{RUNS_OF_DRIVES[table.settings.drive]}")(table, *rig),
     template=TEMPLATE,
     informs="all of them together, and the gap",

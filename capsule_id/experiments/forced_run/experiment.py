@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, stated_rate, stretch
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters, stated_starts
 from capsule_id.experiments.checks import autocorrelation
@@ -25,7 +26,13 @@ from capsule_id.experiments.forced_run.start_state import (
     parts_of,
     rough_start,
 )
-from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel, ground_parameters
+from capsule_id.experiments.friction_model import (
+    EQUATION_1,
+    NORMAL_FORCE,
+    FrictionModel,
+    ground_parameters,
+    instrument_parameters,
+)
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.drive import Drive, Excitation
@@ -178,6 +185,9 @@ class CapsuleRun(CapsuleForward):
         self.channels = tuple(
             Channel(table, name) for name in NOISE if name in table.columns and name not in self.inputs
         )
+        if unread := sorted({name for name, _ in self.instruments} - {*self.names, "time"}):
+            rule = f"an instrument of a run must have read a channel, not {unread[0]}, which drives it"
+            raise InputError(rule, table.label, f"remove {unread[0]}_instrument", rig.folder / "rig.toml")
         self.time, self.Omega = table["time"], stated_Omega(table)
         whole = next((other for other in rig.tables if other.label == part_of), table)["time"]
         rate, self.first = stated_rate(table), float(whole[0])
@@ -208,7 +218,7 @@ class CapsuleRun(CapsuleForward):
         of, whole, settings, free = self.label, self.about.record, self.table.settings, self.rig.model.free
         rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
         rows += [parameter(name) for name in ("k_cubic", "c2")[: 1 if self.spring is None else 2] if name in free]
-        rows += clock_parameters(self.table, self.rig)
+        rows += [*clock_parameters(self.table, self.rig), *instrument_parameters(self.table)]
         rows += [] if self.spring is None else [parameter("k2", self.spring)]
         rows += stated_parameters("G", settings.gap, whole)
         if self.driven_by_current:
@@ -231,7 +241,8 @@ class CapsuleRun(CapsuleForward):
 
     def unstated_errors(self, symbol: str) -> set[str]:
         """The offsets of all channels are free."""
-        gains = all(channel.gain_sd is not None for channel in self.channels)
+        read_by = dict(self.instruments)
+        gains = all(channel.gain_sd is not None or channel.name in read_by for channel in self.channels)
         return super().unstated_errors(symbol) | (set() if gains else {"gain"})
 
     def starts(self) -> dict[str, Start]:
@@ -405,7 +416,7 @@ class CapsuleRun(CapsuleForward):
         parts = []
         for channel, seen in zip(self.channels, self.predict(theta, xp), strict=True):
             rho = xp.tanh(theta[f"ar1_{channel.name}"]) if self.coloured else None
-            parts.append(channel.misfit(seen, self.time, rho, xp))
+            parts.append(channel.misfit(self.instrument(channel.name, theta)[0] * seen, self.time, rho, xp))
         if self.second_reading is not None:
             stated, sd = self.second_reading
             raw = stated - theta["K"] * theta["I_d"]
