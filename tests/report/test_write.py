@@ -84,14 +84,14 @@ def test_figures_are_those_of_the_page_at_150_dpi(folder: Path) -> None:
 
 def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> None:
     content = _strict((folder / "parameters.json").read_text(encoding="utf-8"))
-    assert list(content) == ["rig", "synthetic", "trust", "parameters", "verdict", "records", "provenance"]
+    assert list(content) == ["rig", "synthetic", "trust", "not_in_sd", "parameters", "verdict", "records", "provenance"]
     assert content["rig"] == "twin"
     assert content["synthetic"] is True
     assert list(content["parameters"]) == list(result.summary.index)
     assert content["trust"] == "trusted"
     keys = [
         "unit", "value", "sd", "sd_unwidened", "widening", "quote", "basis", "trust", "ci95", "paper", "map", "mean", "median",
-        "ci95_unwidened", "ess", "ess_bulk", "ess_tail", "rhat", "informed",
+        "ci95_unwidened", "ess", "ess_bulk", "ess_tail", "rhat", "informed", "not_in_sd",
     ]  # fmt: skip
     for name, entry in content["parameters"].items():
         row = result.summary.loc[name]
