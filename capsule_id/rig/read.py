@@ -93,15 +93,8 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
             with collecting(faults):
                 stated[key] = head[key].quantity(rule.si, rule.domain, rule.has_sd)
     ground = {key: stated[key] for key in ("slope", "N0") if key in stated}
-    instruments = _instruments(root)
     tables, files = _read_experiments(root, kinds, ground, faults)
     raise_all(faults)
-    for instrument in {*instruments} - {c.instrument.name for t in tables for c in t.columns.values() if c.instrument}:
-        rule, remedy = (
-            "an instrument must have read a column",
-            f'write <column>_instrument = "{instrument}" in an experiment',
-        )
-        raise instruments[instrument].error(rule, "none", remedy)
     model = read_model(root)
     check_masses(root, model, tables, kinds, set(stated))
     check_engine(root, model, tables)
@@ -205,6 +198,8 @@ def _read_experiments(
                 )
             tables.append(table)
             files |= sha256
+    if not faults:
+        _refuse_idle_instruments(root, tables)
     return tuple(tables), files
 
 
@@ -289,6 +284,18 @@ def _instruments(root: Node) -> dict[str, Node]:
             raise node.error(rule, shown(node.value), "correct it, or remove it")
         found[name] = node
     return found
+
+
+def _refuse_idle_instruments(root: Node, tables: Sequence[Table]) -> None:
+    """Refuse an instrument that has read no column: a line of an experiment may be missing."""
+    used = {c.instrument.name for table in tables for c in table.columns.values() if c.instrument is not None}
+    for name, node in _instruments(root).items():
+        if name not in used:
+            rule, remedy = (
+                "an instrument must have read a column",
+                f'write <column>_instrument = "{name}" in an experiment',
+            )
+            raise node.error(rule, "none", remedy)
 
 
 def _instrument_of(entry: Node, column: str) -> Node | None:
