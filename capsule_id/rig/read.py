@@ -50,7 +50,7 @@ from capsule_id.views import counted
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
 _READING_ERRORS = ("_sd", "_resolution", "_instrument")
 #: Largest gain of an instrument and its sd: a gain of 0.01 reads 1 % too much.
-LARGEST_GAIN = 0.5
+LARGEST_GAIN = 0.2
 #: Smallest stated reading error relative to the largest reading; below it rounding exceeds the error.
 SMALLEST_RELATIVE_ERROR = 1e-12
 
