@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from copy import copy
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import emcee
 import h5py
@@ -153,14 +153,8 @@ RESCALED, FACTOR = 0.2, 0.7
 Moves = list[tuple[Any, float]]
 #: (w, d) -> (w, blocks), log-density of each block; or (w, blocks, k), log-density and what else is kept of each block.
 Parts = Callable[[np.ndarray], np.ndarray]
-
-
-class Walkers(NamedTuple):
-    """Walkers at coords (w, d), with their ``Parts``, and the log-density of each block in the proposal, (w, blocks)."""
-
-    coords: np.ndarray
-    parts: np.ndarray
-    proposed: np.ndarray
+#: After a step: places (w, d), ``Parts`` there, and which blocks were accepted, (w, blocks).
+Step = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class BlockMove(emcee.moves.Move):
@@ -177,27 +171,20 @@ class BlockMove(emcee.moves.Move):
     def __init__(self, proposal: BlockProposal) -> None:
         self.proposal, self.blocks = proposal, proposal.blocks
 
-    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
-        return Walkers(coords, log_density(coords), self.proposal.log_density(coords))
-
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
-        parts = _parts(state.blobs, self.blocks)
-        before = Walkers(state.coords, parts, self.proposal.log_density(state.coords))
-        after, accepted = self.step(_exact(model, self.blocks), before, model.random)
-        return _state(state, after.coords, after.parts), np.mean(accepted, axis=1)
+        parts, exact = _parts(state.blobs, self.blocks), _exact(model, self.blocks)
+        coords, parts, accepted = self.step(exact, state.coords, parts, model.random)
+        return _state(state, coords, parts), np.mean(accepted, axis=1)
 
-    def step(self, log_density: Parts, before: Walkers, random: Random) -> tuple[Walkers, np.ndarray]:
-        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
+    def step(self, log_density: Parts, coords: np.ndarray, parts: np.ndarray, random: Random) -> Step:
         proposal = self.proposal
-        drawn = proposal.draw(random, len(before.coords))
-        new = np.where(np.isfinite(drawn), drawn, before.coords)
-        proposed = proposal.log_density(new)
+        drawn = proposal.draw(random, len(coords))
+        new = np.where(np.isfinite(drawn), drawn, coords)
         # A draw outside the domain has the density 0.
         inside = np.stack([np.all(np.isfinite(drawn[:, block]), axis=1) for block in proposal.blocks], axis=1)
-        factors = np.where(inside, before.proposed - proposed, -np.inf)
-        coords, parts, accepted = accept(random, before, new, log_density(new), factors, proposal.blocks)
-        return Walkers(coords, parts, np.where(accepted, proposed, before.proposed)), accepted
+        factors = np.where(inside, proposal.log_density(coords) - proposal.log_density(new), -np.inf)
+        return accept(random, coords, parts, new, log_density(new), factors, proposal.blocks)
 
 
 class RandomWalk:
@@ -213,17 +200,12 @@ class RandomWalk:
         self.blocks = blocks
         self._roots = [np.linalg.cholesky(covariance[np.ix_(block, block)]) for block in blocks]
 
-    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
-        parts = log_density(coords)
-        return Walkers(coords, parts, np.zeros_like(parts))
-
-    def step(self, log_density: Parts, before: Walkers, random: Random) -> tuple[Walkers, np.ndarray]:
-        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
-        new = before.coords.copy()
+    def step(self, log_density: Parts, coords: np.ndarray, parts: np.ndarray, random: Random) -> Step:
+        new = coords.copy()
         for block, root in zip(self.blocks, self._roots, strict=True):
             new[:, block] += random.standard_normal((len(new), len(block))) @ root.T
-        coords, parts, moved = accept(random, before, new, log_density(new), before.proposed, self.blocks)
-        return Walkers(coords, parts, before.proposed), moved
+        none = np.zeros((len(new), len(self.blocks)))
+        return accept(random, coords, parts, new, log_density(new), none, self.blocks)
 
 
 class Rescaling:
@@ -243,13 +225,8 @@ class Rescaling:
         self.blocks = blocks
         self._scaled = [(next(i for i, block in enumerate(blocks) if one.scatter in block), one) for one in scaled]
 
-    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
-        parts = log_density(coords)
-        return Walkers(coords, parts, np.zeros_like(parts))
-
-    def step(self, log_density: Parts, before: Walkers, random: Random) -> tuple[Walkers, np.ndarray]:
-        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
-        new, factors = before.coords.copy(), np.zeros_like(before.proposed)
+    def step(self, log_density: Parts, coords: np.ndarray, parts: np.ndarray, random: Random) -> Step:
+        new, factors = coords.copy(), np.zeros((len(coords), len(self.blocks)))
         rescales = random.uniform() < 0.5
         for block, (scale, own, balanced) in self._scaled:
             t = random.standard_normal(len(new))
@@ -260,8 +237,7 @@ class Rescaling:
             else:
                 new[:, own] += t[:, None]
                 new[:, balanced] -= (np.exp(new[:, scale]) * t)[:, None]
-        coords, parts, moved = accept(random, before, new, log_density(new), factors, self.blocks)
-        return Walkers(coords, parts, before.proposed), moved
+        return accept(random, coords, parts, new, log_density(new), factors, self.blocks)
 
 
 class DelayedMove(emcee.moves.Move):
@@ -281,40 +257,37 @@ class DelayedMove(emcee.moves.Move):
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
-        blocks = self.inner.blocks
-        begin = self.inner.begin(self.emulated, state.coords)
+        blocks, end = self.inner.blocks, state.coords
+        begin = emulated = self.emulated(end)
         with np.errstate(invalid="ignore"):  # a walker at the emulated density 0 stays, until another move takes it on
-            end = begin
             for _ in range(self.steps):
-                end, _ = self.inner.step(self.emulated, end, model.random)
-            factors = begin.parts - end.parts
-            before = Walkers(state.coords, _parts(state.blobs, blocks), begin.proposed)
-            found = _exact(model, blocks)(end.coords)
-            coords, parts, accepted = accept(model.random, before, end.coords, found, factors, blocks)
-        moved = [np.any(end.coords[:, block] != begin.coords[:, block], axis=1) for block in blocks]
+                end, emulated, _ = self.inner.step(self.emulated, end, emulated, model.random)
+            before, found = _parts(state.blobs, blocks), _exact(model, blocks)(end)
+            coords, parts, accepted = accept(model.random, state.coords, before, end, found, begin - emulated, blocks)
+        moved = [np.any(end[:, block] != state.coords[:, block], axis=1) for block in blocks]
         return _state(state, coords, parts), np.mean(accepted & np.stack(moved, axis=1), axis=1)
 
 
 def accept(
     random: Random,
-    before: Walkers,
+    coords: np.ndarray,
+    parts: np.ndarray,
     new: np.ndarray,
     new_parts: np.ndarray,
     factors: np.ndarray,
     blocks: Sequence[np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> Step:
     """Accept or refuse each block of the proposals ``new`` (w, d) by Metropolis–Hastings.
-
-    Return coordinates (w, d) and ``Parts`` after it, and which blocks are accepted, (w, blocks).
 
     Parameters
     ----------
+    coords, parts : places (w, d) of the walkers, and ``Parts`` there
     new_parts : ``Parts`` at ``new``
     factors : (w, blocks) log of the proposal density of the old place over that of the new one
     """
-    old, found = (np.reshape(parts, (*factors.shape, -1)) for parts in (before.parts, new_parts))
+    old, found = (np.reshape(each, (*factors.shape, -1)) for each in (parts, new_parts))
     accepted = np.log(random.uniform(size=factors.shape)) < found[..., 0] - old[..., 0] + factors
-    coords = before.coords.copy()
+    coords = coords.copy()
     for i, block in enumerate(blocks):
         coords[:, block] = np.where(accepted[:, i, None], new[:, block], coords[:, block])
     parts = np.where(accepted[..., None], found, old)

@@ -54,7 +54,7 @@ def test_a_wrong_emulator_does_not_change_the_posterior(monkeypatch: pytest.Monk
 
     # Negative control: proposals are accepted without regard to the density that they come from.
     accept = moves.accept
-    monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:4], np.zeros_like(args[4]), args[5]))
+    monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:5], np.zeros_like(args[5]), args[6]))
     assert np.max(np.abs(scores(draw().draws, Gaussian(MEAN, SIGMA)))) > LIMIT
 
 
@@ -190,7 +190,7 @@ def test_rescaling_keeps_the_posterior_and_follows_a_hyperbola(monkeypatch: pyte
     # A mean over independent draws has a variance of 1/1200; without these steps each walker stays on its part.
     assert sample(rescales=False)[2] > 3.0 * of_means
     accept = moves.accept
-    monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:4], 0.0 * args[4], args[5]))
+    monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:5], 0.0 * args[5], args[6]))
     assert abs(sample(rescales=True)[0]) > LIMIT
 
 
