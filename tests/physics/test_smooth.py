@@ -72,8 +72,8 @@ def _slope(cases: Cases, smoothings: list[Smoothing], kind: str) -> float:
     return float(np.polyfit(np.log([getattr(widths, kind) for widths in smoothings]), np.log(medians), 1)[0])
 
 
-def _tanh_field(system: smooth.System, piece: jnp.ndarray | None = None) -> smooth.Field:
-    del piece  # a harmonic drive has one
+def _tanh_field(system: smooth.System, semantics: str, piece: jnp.ndarray | None = None) -> smooth.Field:
+    del semantics, piece  # a harmonic drive has one
     p, e, law, widths = system
 
     def field(t: jnp.ndarray, r: jnp.ndarray, Y1: jnp.ndarray, Y2: jnp.ndarray) -> tuple[jnp.ndarray, ...]:
@@ -89,7 +89,7 @@ def test_switch_in_velocity_alone_turns_the_capsule_round(cases: Cases, monkeypa
     p, e, T = cases.one("fig6_k2_20")
     widths = replace(FINE, velocity=1e-2)
     ours = simulate(p, e, T * np.arange(11), model="smooth", smoothing=widths)
-    monkeypatch.setattr(smooth, "stick_slip_field", _tanh_field)
+    monkeypatch.setattr(smooth, "field_of", _tanh_field)
     smooth._compiled.cache_clear()
     tanh = simulate(p, e, T * np.arange(11), model="smooth", smoothing=widths)
     smooth._compiled.cache_clear()
@@ -133,7 +133,7 @@ def test_eq2_freezes_a_sliding_capsule(cases: Cases) -> None:
 def test_smooth_field_against_scipy(cases: Cases) -> None:
     p, e, T = cases.one("fig6_k2_30")
     widths = Smoothing(velocity=1e-3, penetration=1e-5, rounding=0.05)
-    field = jax.jit(smooth.stick_slip_field((p, e, friction_law(p), widths)))
+    field = jax.jit(smooth.field_of((p, e, friction_law(p), widths), "stick-slip"))
 
     def rate(t: float, y: np.ndarray) -> list[float]:
         a1, v2, a2 = field(jnp.asarray(t), jnp.asarray(y[0] - y[2]), jnp.asarray(y[1]), jnp.asarray(y[3]))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
+from operator import and_
 from typing import Literal
 
 import jax
@@ -23,7 +24,6 @@ from capsule_id.physics.forces import (
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Trajectory, admissible
 from capsule_id.physics.smooth.march import Field, Problem, differentiable_run
-from capsule_id.precision import require_float64
 
 # friction: The smoothed stick-slip rule, and the force gate of eq. (2) to the letter; any friction law, forces in N.
 
@@ -95,8 +95,6 @@ def force_gate(law: FrictionLaw, F_b: Array, f: Array, rounding: Array) -> jax.A
 # motion, and is offered so that the difference can be shown.
 
 
-require_float64()
-
 Semantics = Literal["stick-slip", "eq2"]
 # First step, as a fraction of the fastest time scale known before the run.
 FIRST_STEP = 0.05
@@ -127,50 +125,28 @@ class Smoothing:
     tolerance: Array = 2e-5
 
 
-def stick_slip_field(system: System, piece: jax.Array | None = None) -> Field:
-    """The field whose limit is the exact model, on the piece of the drive that holds at the time ``piece`` (L,), s."""
-    _, _, law, widths = system
-    F_b = breakaway(law)
-    forces = _forces(system, piece)
+def field_of(system: System, semantics: Semantics, piece: jax.Array | None = None) -> Field:
+    """The field on the piece of the drive that holds at the time ``piece`` (L,), s.
+
+    The limit of "stick-slip" is the exact model. "eq2" is eq. (2) to the letter, with its force gate smoothed over
+    ``rounding``: for comparison only.
+    """
+    p, e, law, widths = system
+    F_b, weights = breakaway(law), weights_along(p)
 
     def field(t: jax.Array, r: jax.Array, Y1: jax.Array, Y2: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        Y1_rate, f = forces(t, r, Y1 - Y2)
-        held = friction_smooth(law, F_b, Y2, f, (widths.velocity, widths.rounding))
-        return Y1_rate, Y2, (f - held) / system[0].m2
-
-    return field
-
-
-def eq2_field(system: System, piece: jax.Array | None = None) -> Field:
-    """The field of eq. (2) to the letter, with its force gate smoothed over ``rounding``: for comparison only."""
-    _, _, law, widths = system
-    F_b = breakaway(law)
-    forces = _forces(system, piece)
-
-    def field(t: jax.Array, r: jax.Array, Y1: jax.Array, Y2: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        Y1_rate, f = forces(t, r, Y1 - Y2)
-        gate = force_gate(law, F_b, f, widths.rounding)
-        forth = smooth_heaviside(Y2, widths.velocity)
+        D = e.force_at(t, piece)
+        rod, f = along_ground(rod_on_capsule(p, r, Y1 - Y2, widths.penetration), D, e.reaction, weights)
+        Y1_rate = D if e.prescribed else rod / p.m1
+        if semantics == "stick-slip":
+            held = friction_smooth(law, F_b, Y2, f, (widths.velocity, widths.rounding))
+            return Y1_rate, Y2, (f - held) / p.m2
+        gate, forth = force_gate(law, F_b, f, widths.rounding), smooth_heaviside(Y2, widths.velocity)
         speed = smooth_abs(Y2, widths.velocity)
         sliding = forth * law.forward(speed) - (1.0 - forth) * law.backward(speed)
-        return Y1_rate, gate * Y2, gate * (f - sliding) / system[0].m2
+        return Y1_rate, gate * Y2, gate * (f - sliding) / p.m2
 
     return field
-
-
-def _forces(
-    system: System, piece: jax.Array | None
-) -> Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    """(t, r, w) -> (Y1', m/s^2; force on the capsule but for friction, N)."""
-    p, e, _, widths = system
-    weights = weights_along(p)
-
-    def forces(t: jax.Array, r: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        D = e.force_at(t, piece)
-        rod, capsule = along_ground(rod_on_capsule(p, r, w, widths.penetration), D, e.reaction, weights)
-        return D if e.prescribed else rod / p.m1, capsule
-
-    return forces
 
 
 def _nearest(p: CapsuleParameters, side: float) -> jax.Array:
@@ -183,14 +159,6 @@ def _nearest(p: CapsuleParameters, side: float) -> jax.Array:
     return reduce(jnp.minimum, gaps, jnp.full_like(p.m1, jnp.inf))  # pyright: ignore[reportArgumentType]
 
 
-def _valid(system: System) -> jax.Array:
-    p, e, law, widths = system
-    ok = admissible(p, e, law)
-    for width in vars(widths).values():
-        ok = ok & jnp.isfinite(width) & (width > 0.0)
-    return ok
-
-
 def _problem(system: System, semantics: Semantics) -> Problem:
     p, e, law, widths = system
     lightness = 1.0 / p.m1 + 1.0 / p.m2
@@ -200,16 +168,16 @@ def _problem(system: System, semantics: Semantics) -> Problem:
     springs, d = [force.elastic for force in forces_of(p)], widths.penetration + jnp.zeros_like(p.m1)
     stiffness = jax.jvp(lambda d: total(elastic(d) for elastic in springs), (d,), (jnp.ones_like(d),))[1]
     fastest = jnp.sqrt(jnp.abs(stiffness) * lightness) + p.c * lightness + e.frequency() + friction_rate
-    field = stick_slip_field if semantics == "stick-slip" else eq2_field
+    fine = [jnp.isfinite(width) & (width > 0.0) for width in vars(widths).values()]
     return Problem(
-        field=partial(field, system),
+        field=partial(field_of, system, semantics),
         drive=e,
         gaps=(_nearest(p, 1.0), _nearest(p, -1.0)),
         first=FIRST_STEP / fastest,
         longest=DRIVE_ANGLE / e.frequency(),
         floors=(jnp.asarray(widths.velocity), jnp.asarray(widths.penetration)),
         tolerance=jnp.asarray(widths.tolerance),
-        valid=_valid(system),
+        valid=reduce(and_, fine, admissible(p, e, law)),
     )
 
 
