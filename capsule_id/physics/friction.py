@@ -10,7 +10,6 @@ import numpy as np
 
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module
-from capsule_id.precision import require_float64
 
 # series: Polynomials in the scaled time s of a Taylor step: lists of coefficients, one array (L,) per order.
 #
@@ -73,13 +72,11 @@ def mean(p: Series, s: jax.Array) -> jax.Array:
     return horner([x * (1.0 / (k + 1)) for k, x in enumerate(p)], s)
 
 
-# friction: Friction between capsule and ground: the law of sliding resistance, the stick-slip rule, the slide to rest.
+# friction: Friction between capsule and ground: the law of sliding resistance, the slide to rest.
 #
 # A friction law is a class with the methods of ``FrictionLaw``. ``simulate(p, e, times, friction=law)`` takes any such
 # law, in both engines; nothing else has to be changed. Forces in N, velocities in m/s, masses in kg.
 
-
-require_float64()
 
 #: Panels that many slides share, finer towards rest: 2e-8 relative where v_s is a tenth of the largest speed.
 PANELS = 128
@@ -224,19 +221,6 @@ def sliding_friction(law: FrictionLaw, sigma: Any, v: Any) -> jax.Array:
     """Friction in N with the sign of the direction sigma (+1, -1; 0 gives 0) at the velocity v, m/s."""
     speed = sigma * v
     return sigma * jnp.where(sigma < 0.0, law.backward(speed), law.forward(speed))
-
-
-def friction(law: FrictionLaw, Y2: NumberOrBatch, f: NumberOrBatch) -> jax.Array:
-    """Exact stick-slip rule: the force of the ground on the capsule, N, so that m2 X2'' = f - friction.
-
-    Sliding (Y2 != 0): the law's resistance with the sign of Y2, whatever f.
-    At rest (Y2 = 0): f itself while -backward(0) <= f <= forward(0), so that the capsule stays; else the threshold,
-    so that it sets off in the direction of f.
-    """
-    Y2, f = jnp.asarray(Y2), jnp.asarray(f)
-    still = jnp.zeros_like(Y2)
-    held = jnp.clip(f, -law.backward(still), law.forward(still))
-    return jnp.where(Y2 == 0.0, held, sliding_friction(law, jnp.sign(Y2), Y2))
 
 
 def slide_distance(law: FrictionLaw, mass: Any, speed: Any) -> Any:

@@ -18,7 +18,7 @@ from capsule_id.physics.drive import Excitation
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.energy import energy_balance
 from capsule_id.physics.forces import Force, Spring
-from capsule_id.physics.friction import CoulombStribeck, friction
+from capsule_id.physics.friction import CoulombStribeck, sliding_friction
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import breakaway, force_gate, friction_smooth
@@ -87,15 +87,7 @@ def test_smoothed_is_exact_outside_its_width() -> None:
     Y2 = jnp.asarray([-2.0, -1e-2, -1.6e-3, 1.6e-3, 1e-2, 2.0])
     for f in (-50.0, -F_B, -1.0, 0.0, 1.0, F_B, 50.0):
         held = friction_smooth(LAW, F_B, Y2, jnp.full(6, f), (1e-3, 0.05))
-        np.testing.assert_allclose(held, friction(LAW, Y2, jnp.full(6, f)), rtol=1e-12)
-
-
-def test_exact_friction_sticks_up_to_the_threshold_and_no_further() -> None:
-    f = jnp.asarray([-5.0, -F_B, -1.0, 0.0, 1.0, F_B, 5.0])
-    held = friction(LAW, jnp.zeros(7), f)
-    np.testing.assert_allclose(held, [-F_B, -F_B, -1.0, 0.0, 1.0, F_B, F_B], rtol=1e-15)
-    # Moving, it does not depend on the force, and falls to half of the threshold.
-    np.testing.assert_allclose(friction(LAW, jnp.full(7, -1e6), f), -0.5 * F_B, rtol=1e-15)
+        np.testing.assert_allclose(held, sliding_friction(LAW, jnp.sign(Y2), Y2), rtol=1e-12)
 
 
 def test_smoothed_friction_does_not_creep_where_tanh_does() -> None:
@@ -110,10 +102,9 @@ def test_smoothed_friction_does_not_creep_where_tanh_does() -> None:
 @pytest.mark.parametrize("rounding", [0.01, 0.1])
 def test_narrow_switch_tends_to_the_exact_rule(rounding: float) -> None:
     Y2 = jnp.asarray([-0.3, -1e-3, 1e-3, 0.3])
+    sliding = sliding_friction(LAW, jnp.sign(Y2), Y2)
     f = jnp.asarray([3.0, 9.0, -9.0, -3.0])
-    gap = [
-        np.abs(friction_smooth(LAW, F_B, Y2, f, (w, rounding)) - friction(LAW, Y2, f)).max() for w in (1e-2, 1e-3, 1e-4)
-    ]
+    gap = [np.abs(friction_smooth(LAW, F_B, Y2, f, (w, rounding)) - sliding).max() for w in (1e-2, 1e-3, 1e-4)]
     assert gap[0] > 1.0
     assert gap[2] < 1e-12
 
@@ -165,7 +156,6 @@ class _Ramped:
 
 def test_a_law_with_two_thresholds() -> None:
     f = jnp.asarray([-5.0, -2.9, -1.0, 1.9, 5.0])
-    np.testing.assert_allclose(friction(_Ramped(), jnp.zeros(5), f), [-3.0, -2.9, -1.0, 1.9, 2.0], rtol=1e-15)
     smooth = friction_smooth(_Ramped(), breakaway(_Ramped()), jnp.zeros(5), f, (1e-3, 0.01))
     np.testing.assert_allclose(smooth, [-3.0, -2.9, -1.0, 1.9, 2.0], rtol=1e-12)
     for Y2, expected in ((0.4, 2.2), (-0.4, -3.04)):
