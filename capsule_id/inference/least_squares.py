@@ -21,15 +21,13 @@ from capsule_id.inference.curvature import (
 )
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.batches import pool
-from capsule_id.precision import COMPILE, COMPILE_QUICKLY, require_float64
+from capsule_id.precision import COMPILE, COMPILE_QUICKLY
 
 # least squares: Nonlinear least squares from several starts, with the covariance of the parameters.
 #
 # Residuals r(x), (d,) -> (n,); cost ½ Σ r²; J = ∂r/∂x, (n, d). At the minimum the covariance of the parameters is
 # σ² (JᵀJ)⁻¹ with σ² = Σ r² / (n − d) unless it is known (Seber & Wild, *Nonlinear Regression*, 1989, ch. 2).
 
-
-require_float64()
 
 #: A point (d,) -> residuals (n,) and their Jacobian (n, d).
 Linearise = Callable[[np.ndarray], tuple[Residuals, Jacobian]]

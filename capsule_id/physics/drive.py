@@ -14,10 +14,6 @@ import jax.numpy as jnp
 from capsule_id.parameters import DRIVES, TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module
 from capsule_id.physics.friction import Series
-from capsule_id.precision import require_float64
-
-require_float64()
-
 
 Piece = tuple[jax.Array, ...]
 

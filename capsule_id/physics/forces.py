@@ -12,7 +12,6 @@ import numpy as np
 from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module
 from capsule_id.physics.drive import Drive
-from capsule_id.precision import require_float64
 
 # grazing: Where contacts begin: the load at which a rod on a capsule at rest just reaches the support spring.
 
@@ -41,8 +40,6 @@ def grazing_load(
 # Each is a C2 step of compact support: outside its width the smoothed function *is* the exact one, and its slope and
 # curvature stay below 15 / (16 width) and 5 / (2 sqrt(3) width^2). All functions work elementwise.
 
-
-require_float64()
 
 Array = jax.Array | float
 

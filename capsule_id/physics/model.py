@@ -36,9 +36,6 @@ from capsule_id.physics.batches import NumberOrBatch, is_traced
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drive import Excitation as Excitation
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw
-from capsule_id.precision import require_float64
-
-require_float64()
 
 Initial = tuple[NumberOrBatch, NumberOrBatch, NumberOrBatch, NumberOrBatch]
 

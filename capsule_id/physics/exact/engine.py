@@ -40,7 +40,6 @@ from capsule_id.physics.exact.taylor import (
 from capsule_id.physics.forces import Force
 from capsule_id.physics.friction import DEGREE, FrictionLaw, Scaled, horner, mean, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Initial, Status, Trajectory, admissible
-from capsule_id.precision import require_float64
 
 # one function: A program that XLA compiles as one function on a CPU.
 
@@ -167,8 +166,6 @@ def read_off(
 # correction, dt = -g/g', whose value is next to nothing and whose tangent is the event's own (the saltation
 # matrix). Switching times of the drive are events with g = t - t_switch.
 
-
-require_float64()
 
 # Steps kept before samples are read off them; a buffer of this many rows stays in the second-level cache.
 ROWS = 64
