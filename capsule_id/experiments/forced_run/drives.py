@@ -522,11 +522,11 @@ class BaseRun(OtherRun):
             return starts
         m1 = 0.0 if self.rig.m1 is None else self.rig.m1.value
         masses = {"m1": m1, "m2": self.rig.m2.value, "g": self.rig.g.value}
-        per_mu = self.law({**masses, **self.stated_ground, "mu": 1.0, "mu_back": 1.0}).forward(found.speed)
-        values = {"k1": found.k1, "c": found.c, "mu": found.friction / float(per_mu)}
+        per_mu = self.law({**masses, **self.stated_ground, "mu": 1.0, "mu_back": 1.0}).forward(found["speed"])
+        values = {"k1": found["k1"], "c": found["c"], "mu": found["friction"] / float(per_mu)}
         starts |= {name: Start(value, SPREAD[name]) for name, value in values.items()}
         at_first = f"x_start[{self.label}]"
-        return starts | {at_first: Start(float(r[0]) + found.extension, starts[at_first].spread)}
+        return starts | {at_first: Start(float(r[0]) + found["extension"], starts[at_first].spread)}
 
     def law(self, theta: ValuesBySymbol) -> FrictionLaw:
         return super().law({"m1": 0.0, **theta})

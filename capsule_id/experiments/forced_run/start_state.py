@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -30,18 +29,10 @@ SLIDING, SHORTEST_SLIDE = 0.2, 10
 LEAST_DAMPING = 1e-3
 
 
-class Slides(NamedTuple):
-    """Starting values, SI; ``extension``: of the spring where r = 0; ``speed``: mean of the sliding capsule."""
-
-    k1: float
-    c: float
-    friction: float
-    extension: float
-    speed: float
-
-
-def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: float) -> Slides | None:
+def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: float) -> dict[str, float] | None:
     """Estimate spring, damper and constant friction from the slides of a record; None where they do not determine them.
+
+    Values, SI, by name: k1, c, friction, the extension of the spring where r = 0, the mean speed of the sliding capsule.
 
     Parameters
     ----------
@@ -69,7 +60,8 @@ def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: f
     if not (k1 > 0.0 and friction > 0.0):
         return None
     speed = float(np.mean(np.abs(rate[direction != 0.0])))
-    return Slides(k1, max(c, 2.0 * LEAST_DAMPING * float(np.sqrt(k1 * m2))), friction, force / k1, speed)
+    c = max(c, 2.0 * LEAST_DAMPING * float(np.sqrt(k1 * m2)))
+    return {"k1": k1, "c": c, "friction": friction, "extension": force / k1, "speed": speed}
 
 
 def _slide(time: np.ndarray, r: np.ndarray, momentum: np.ndarray, direction: float) -> np.ndarray:
