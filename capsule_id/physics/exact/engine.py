@@ -79,23 +79,15 @@ def as_one_function(run: Callable[..., Any]) -> Callable[..., tuple[Any, jax.Arr
 WIDTH = 4 + 2 * (DEGREE + 1)
 # Samples of a lane read off at once.
 WINDOW = 64
+# (L, 4, n + WINDOW) X1, Y1, X2, Y2 at the times (L, n + WINDOW), padded with inf; (L,) int32, the next sample.
+Samples = tuple[Float[jax.Array, "L 4 padded"], Int[jax.Array, " L"]]
 
 
-class Samples(NamedTuple):
-    """times (L, n + WINDOW), padded with inf; values (L, 4, n + WINDOW) of X1, Y1, X2, Y2; next sample (L,) int32."""
-
-    times: Float[jax.Array, "L padded"]
-    values: Float[jax.Array, "L 4 padded"]
-    next: Int[jax.Array, " L"]
-
-
-def samples_at(times: Float[jax.Array, "L n"], initial: Initial, valid: Bool[jax.Array, " L"]) -> Samples:
+def first_samples(times: Float[jax.Array, "L n"], initial: Initial, valid: Bool[jax.Array, " L"]) -> Samples:
     """No sample taken yet but the first, which is the initial state."""
-    L, n = times.shape
-    padded = jnp.concatenate([times, jnp.full((L, WINDOW), jnp.inf)], axis=1)
-    values = jnp.full((L, 4, n + WINDOW), jnp.nan)
+    values = jnp.full((len(times), 4, times.shape[1] + WINDOW), jnp.nan)
     first = jnp.where(valid[:, None], jnp.stack([jnp.asarray(x) for x in initial], axis=1), jnp.nan)
-    return Samples(padded, values.at[:, :, 0].set(first), jnp.ones(L, jnp.int32))
+    return values.at[:, :, 0].set(first), jnp.ones(len(times), jnp.int32)
 
 
 def row_of(state: CapsuleState, step: StepSeries) -> Float[jax.Array, "width L"]:
@@ -125,6 +117,7 @@ def _row_at(starts: Float[jax.Array, "K L"], t: Float[jax.Array, "L window"]) ->
 
 
 def read_off(
+    times: Float[jax.Array, "L padded"],
     samples: Samples,
     rows: Float[jax.Array, "K width L"],
     starts: Float[jax.Array, "K L"],
@@ -132,7 +125,7 @@ def read_off(
 ) -> Samples:
     """Take every sample up to ``reached`` (L,) off the rows."""
     starts, reached = jax.lax.stop_gradient((starts, reached))
-    L, length = samples.times.shape
+    L, length = times.shape
     # A row's coefficients side by side: read one lane at a time they would each cost a line of the cache.
     table = jnp.reshape(jnp.swapaxes(rows, 1, 2), (-1, WIDTH))
     slice_times = jax.vmap(lambda row, at: jax.lax.dynamic_slice(row, (at,), (WINDOW,)))
@@ -140,20 +133,19 @@ def read_off(
 
     def pending(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
         _, at = carry
-        upcoming = jnp.take_along_axis(samples.times, jnp.minimum(at, length - 1)[:, None], axis=1)[:, 0]
+        upcoming = jnp.take_along_axis(times, jnp.minimum(at, length - 1)[:, None], axis=1)[:, 0]
         return jnp.any(upcoming <= reached)
 
     def window(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         values, at = carry
-        t = slice_times(samples.times, at)
+        t = slice_times(times, at)
         covered = t <= reached[:, None]
         row = table[_row_at(starts, jax.lax.stop_gradient(t)) * L + jnp.arange(L, dtype=jnp.int32)[:, None]]
         taken = jnp.stack(values_of(jnp.moveaxis(row, -1, 0), jnp.where(covered, t, 0.0)), axis=1)
         taken = jnp.where(covered[:, None, :], taken, jnp.nan)
         return write(values, taken, at), at + jnp.sum(covered, axis=1, dtype=jnp.int32)
 
-    values, at = jax.lax.while_loop(pending, window, (samples.values, samples.next))
-    return Samples(samples.times, values, at)
+    return jax.lax.while_loop(pending, window, samples)
 
 
 # engine: The event-driven engine: Taylor steps inside a mode, located changes of mode, a clock of its own for every
@@ -363,15 +355,15 @@ def run(
     """
     constants, t_end = constants_of(p, e, law), stop_gradient(t_end)
     lanes = initial_lanes(p, constants, times[:, 0], t_end, initial)
-    samples = samples_at(times, initial, lanes.status == Status.OK)
-    n = times.shape[1]
+    samples, n = first_samples(times, initial, lanes.status == Status.OK), times.shape[1]
+    padded = jnp.concatenate([times, jnp.full((len(times), WINDOW), jnp.inf)], axis=1)
 
     def stretch(carry: tuple[RunState, Samples]) -> tuple[RunState, Samples]:
         lanes, rows, starts = march(constants, t_end, max_steps, carry[0], ROWS)
-        return lanes, read_off(carry[1], rows, starts, lanes.state.t)
+        return lanes, read_off(padded, carry[1], rows, starts, lanes.state.t)
 
-    lanes, samples = jax.lax.while_loop(lambda c: jnp.any(c[0].active), stretch, (lanes, samples))
-    X1, Y1, X2, Y2 = (samples.values[:, i, :n] for i in range(4))
+    lanes, (values, _) = jax.lax.while_loop(lambda c: jnp.any(c[0].active), stretch, (lanes, samples))
+    X1, Y1, X2, Y2 = (values[:, i, :n] for i in range(4))
     counts = lanes.contacts, lanes.status, lanes.steps, lanes.events, lanes.contacts_back
     return Trajectory(times, X1, Y1, X2, Y2, *counts)
 
