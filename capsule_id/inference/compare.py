@@ -15,6 +15,7 @@ from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.marginal import trials_of
 from capsule_id.inference.pipeline import check_readings, second_models
+from capsule_id.inference.point_stage import ERRORS, STRONG, error_of_sum
 from capsule_id.inference.prediction import (
     LARGEST_SHAPE,
     LeftOut,
@@ -65,8 +66,11 @@ def variants_of(rig: Rig, words: Sequence[str]) -> dict[str, ModelChoices]:
     """
     unknown = [word for word in words if word not in WORDS]
     if unknown or not words:
-        rule = f"--compare takes some of {','.join(WORDS)}"
-        raise InputError(rule, ",".join(words) or "nothing", f"write --compare {WORDS[0]}")
+        raise InputError(
+            f"--compare takes some of {','.join(WORDS)}",
+            ",".join(words) or "nothing",
+            f"write --compare {WORDS[0]}",
+        )
     found = {"as stated": rig.model}
     for name, other, gone, free in (row for word, rows in ALTERNATIVES.items() if word in words for row in rows):
         kept = [symbol for symbol in rig.model.free if symbol not in (*gone, *free)]
@@ -82,11 +86,6 @@ def variants_of(rig: Rig, words: Sequence[str]) -> dict[str, ModelChoices]:
 
 #: Fewest settings of a progression: two differences of densities determine a standard error badly.
 FEWEST_SETTINGS = 3
-#: Standard errors by which the best variant must be better for a simpler one to be rejected.
-STANDARD_ERRORS = 2.0
-#: Difference of log-evidence that rejects a simpler variant where only points are compared: a factor of 20, "strong" (Kass &
-#: Raftery 1995).
-STRONG = 3.0
 #: A variant is hopeless, and has no refits, where it is worse by this much and this many standard errors. Smaller
 #: differences mean little (Sivula, Magnusson, Matamoros & Vehtari 2020).
 HOPELESS, HOPELESS_ERRORS = 4.0, 5.0
@@ -107,7 +106,7 @@ class Choice:
         predictions also elpd, the standard errors se and of log_evidence, shape (largest Pareto shape of the densities
         that enter), and refits, none where a variant is far worse than the best; of point fits log_posterior (the
         maximum) and converged
-    recommended : the variant with the fewest parameters within ``STANDARD_ERRORS`` of the best, of point fits within
+    recommended : the variant with the fewest parameters within ``ERRORS`` of the best, of point fits within
         ``STRONG``
     line : the recommendation in words, with the lines of ``[model]``, and what is uncertain
     predictions : of the recommended variant, see ``capsule_id.inference.prediction.left_out_predictions``; None for point
@@ -279,12 +278,16 @@ def _variants(rig: Rig, words: Sequence[str], registry: Registry | None) -> tupl
     choices, kinds = variants_of(rig, words), registry or default_registry()
     made = [e for e in make_experiments(rig, "all", kinds) if isinstance(e, Progression)]
     if not made:
-        remedy = "compare friction laws of bench tests in the report of fit-params"
-        raise InputError("--compare needs a progression", "none", remedy)
+        raise InputError(
+            "--compare needs a progression", "none", "compare friction laws of bench tests in the report of fit-params"
+        )
     for e in made:
         if len(e.settings) < FEWEST_SETTINGS:
-            rule = f"--compare needs {FEWEST_SETTINGS} settings or more in {e.label}"
-            raise InputError(rule, counted(len(e.settings), "setting"), "measure further settings")
+            raise InputError(
+                f"--compare needs {FEWEST_SETTINGS} settings or more in {e.label}",
+                counted(len(e.settings), "setting"),
+                "measure further settings",
+            )
     return choices, kinds
 
 
@@ -316,7 +319,7 @@ def _difference(one: _Variant, best: _Variant) -> tuple[float, float]:
     """Difference of the elpd, and its standard error from the settings; a setting without a density gives -inf, NaN."""
     with np.errstate(invalid="ignore"):
         each = one.density - best.density
-        return float(np.sum(each)), float(np.sqrt(len(each) * np.var(each, ddof=1)))
+        return float(np.sum(each)), error_of_sum(each)
 
 
 def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices], seed: int) -> Choice:
@@ -335,13 +338,11 @@ def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices],
             "shape": one.shape,
             "refits": one.refits,
         }
-    close = [
-        name for name, row in rows.items() if fitted[name] is best or row["difference"] >= -STANDARD_ERRORS * row["se"]
-    ]
+    close = [name for name, row in rows.items() if fitted[name] is best or row["difference"] >= -ERRORS * row["se"]]
     chosen = min(close, key=lambda name: (fitted[name].parameters, -fitted[name].elpd))
     own, table = rows[chosen], _table(rows, "elpd")
     standing = f"elpd {own['difference']:.1f} ± {own['se']:.1f}"
-    said = _recommendation(chosen, choices[chosen], f"{STANDARD_ERRORS:g} standard errors of the best ({standing})")
+    said = _recommendation(chosen, choices[chosen], f"{ERRORS:g} standard errors of the best ({standing})")
     unsure = [name for name in map(str, table.index) if not fitted[name].shape <= LARGEST_SHAPE]
     left, rough = ([name for name in unsure if (fitted[name].refits == 0) == far] for far in (True, False))
     if left:

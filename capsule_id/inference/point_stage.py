@@ -151,11 +151,10 @@ class SampledFit:
 
 #: Friction laws that are compared, the simplest first.
 LAWS = (FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",)))
-#: Difference of penalised log-posteriors that rejects a simpler law: "strong" (Kass & Raftery 1995).
-STRONG = 3.0
-#: Standard errors of the difference that reject a simpler law where every law leaves correlated residuals.
-ERRORS = 2.0
-#: Parts of an excitation period.
+#: Difference of penalised log-posteriors, or of log-evidence, that rejects a simpler model: a factor of 20, "strong" (Kass &
+#: Raftery 1995); and standard errors of the difference, where it has any.
+STRONG, ERRORS = 3.0, 2.0
+#: Parts of an excitation period. They are long beside most waves of a misfit, so that they are independent.
 PHASES = 6
 
 

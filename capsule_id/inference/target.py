@@ -82,10 +82,6 @@ class Priors(eqx.Module):
         """(value - centre)/width for each parameter."""
         return (xp.where(self.lognormal, u, value) - self.centre) / self.width
 
-    def rates(self, value_rates: Any, xp: ModuleType = jnp) -> Any:
-        """Derivative of each of ``residuals`` with respect to u, from those of the values."""
-        return xp.where(self.lognormal, 1.0, value_rates) / self.width
-
 
 def prior_of(row: Parameter) -> Prior:
     """Return the prior of ``row``.
@@ -132,8 +128,11 @@ def covering_prior(name: str, priors: Sequence[Prior]) -> Prior:
     if kinds == {"normal"} and len(locations) == 1:
         return max(priors, key=lambda prior: prior.spread)
     stated = " and ".join(dict.fromkeys(f"{prior.kind} {prior.location:g}, {prior.spread:g}" for prior in priors))
-    rule = f"experiments that share {name} must state one prior for it"
-    raise InputError(rule, f"{stated} (SI)", f"state the same in each of them, or state {name} in [prior]")
+    raise InputError(
+        f"experiments that share {name} must state one prior for it",
+        f"{stated} (SI)",
+        f"state the same in each of them, or state {name} in [prior]",
+    )
 
 
 # groups: Groups of stacked experiments that differ only in numbers; each group is evaluated in one batch.
@@ -411,9 +410,9 @@ class LogPosterior(eqx.Module):
     def linearised(self, u: Any) -> tuple[Any, Any]:
         """Residuals (n,) as in ``residuals``, and their Jacobian (n, l) with respect to the l located entries of u."""
         values, located = self.constrain(u), self.located
-        rates = jnp.where(self.positive, values, 1.0)
+        rates: Any = jnp.where(self.positive, values, 1.0)
         parts = [group.linearised(self._residuals_of, values, rates, located) for group in self.groups]
-        slopes = jnp.diag(self.priors.rates(rates))[:, located]
+        slopes = jnp.diag(jnp.where(self.priors.lognormal, 1.0, rates) / self.priors.width)[:, located]
         residuals = [*(jnp.ravel(part) for part, _ in parts), self.priors.residuals(u, values)]
         return jnp.concatenate(residuals), jnp.concatenate([*(j.reshape(-1, len(located)) for _, j in parts), slopes])
 

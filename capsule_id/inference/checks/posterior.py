@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.lint import WRONG_PREFIX
-from capsule_id.inference.checks.settings import SMALLEST_SCATTER, design
+from capsule_id.inference.checks.settings import SMALLEST_SCATTER, basis_of, design
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.moves import geyer_size
 from capsule_id.inference.point_stage import SampledFit
@@ -290,27 +290,16 @@ SMALLEST_REDUCTION = 0.2
 PRIOR_PULL = 2.5
 
 
-@dataclass(frozen=True)
-class Conflict:
-    """Distance of a prior from the rest of the data.
-
-    Attributes
-    ----------
-    z : distance in sd, standard normal where both agree
-    value, sd : estimate from the rest of the data, SI
-    informed : fraction of the prior's variance that the data remove; near 0 the estimate is unreliable
-    """
-
-    z: float
-    value: float
-    sd: float
-    informed: float
-
-
-def conflicts(s: SampledFit) -> dict[str, Conflict]:
-    """Distance of the priors of physical parameters and scatters, and of every stated one, by name.
+def conflicts(s: SampledFit) -> dict[str, dict[str, float]]:
+    """Distance of the priors of physical parameters and scatters, and of every stated one, by name, as facts.
 
     A scatter far above its prior is one by which the fit explains what its law does not; one below is harmless.
+
+    Returns
+    -------
+    ``z``, distance of a prior from the rest of the data in sd, standard normal where both agree; ``value`` and ``sd``, the
+    estimate from the rest of the data, SI; ``informed``, the fraction of the prior's variance that the data remove: near 0
+    the estimate is unreliable.
     """
     centre, sd = _location(s)
     found = {}
@@ -325,7 +314,7 @@ def conflicts(s: SampledFit) -> dict[str, Conflict]:
         z = (centre[i] - middle) / (width * np.sqrt(informed))
         if default_scatter(s, row):
             z = max(z, 0.0)
-        found[row.name] = Conflict(float(z), float(value), float(scale * alone_sd), informed)
+        found[row.name] = {"z": float(z), "value": float(value), "sd": float(scale * alone_sd), "informed": informed}
     return found
 
 
@@ -343,9 +332,9 @@ def check_priors(s: SampledFit) -> list[Finding]:
     """Check every stated prior, weighing and default prior of a physical parameter against the rest of the data."""
     findings, found = [], conflicts(s)
     for name, conflict in found.items():
-        p = float(2.0 * stats.norm.sf(abs(conflict.z)))
+        p = float(2.0 * stats.norm.sf(abs(conflict["z"])))
         row = s.target.parameters[s.target.names.index(name)]
-        if p * len(found) < LEVEL or (default_scatter(s, row) and conflict.z > PRIOR_PULL):
+        if p * len(found) < LEVEL or (default_scatter(s, row) and conflict["z"] > PRIOR_PULL):
             findings.append(_finding(s, row, conflict, p))
     return findings or [Finding("priors.conflict", "ok", {"number": len(found)})]
 
@@ -361,7 +350,7 @@ def _location(s: SampledFit) -> tuple[np.ndarray, np.ndarray]:
     return np.median(x, axis=0), np.std(x, axis=0)
 
 
-def _finding(s: SampledFit, row: Parameter, conflict: Conflict, p: float) -> Finding:
+def _finding(s: SampledFit, row: Parameter, conflict: Mapping[str, float], p: float) -> Finding:
     """The conflict of one parameter; it concerns all parameters of the experiments that read it."""
     name = row.name
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
@@ -369,7 +358,7 @@ def _finding(s: SampledFit, row: Parameter, conflict: Conflict, p: float) -> Fin
     unit = (
         name in s.rig.priors
         and prior.kind == "lognormal"
-        and abs(abs(math.log10(conflict.value / prior.median)) - 3.0) < WRONG_PREFIX
+        and abs(abs(math.log10(conflict["value"] / prior.median)) - 3.0) < WRONG_PREFIX
     )
     facts = {
         "name": name,
@@ -381,7 +370,7 @@ def _finding(s: SampledFit, row: Parameter, conflict: Conflict, p: float) -> Fin
         "experiments": ", ".join(dict.fromkeys(e.table.label for e in readers)),
         "fitted": s.values[name],
         "p": p,
-        **asdict(conflict),
+        **conflict,
     }
     names = dict.fromkeys([name, *(own.name for e in readers for own in e.parameters)])
     return Finding("priors.conflict", "fail", facts, parameters=tuple(names))
@@ -415,20 +404,18 @@ STATISTICS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def p_values(residuals: np.ndarray, columns: np.ndarray, seed: int = 0) -> dict[str, float]:
+def p_values(residuals: np.ndarray, columns: np.ndarray) -> dict[str, float]:
     """Probability of each statistic of (n,) residuals in replicates; ties count half.
 
     Parameters
     ----------
     columns : (n, p) effect of the fitted parameters on the residuals
     """
-    n = len(residuals)
-    left, size, _ = np.linalg.svd(columns, full_matrices=False)
-    basis = left[:, size > 1e-10 * np.max(size, initial=0.0)]
+    n, basis = len(residuals), basis_of(columns)
     # A reading with much leverage pulls the fit to itself: its residual is smaller than its error.
     spread = np.sqrt(np.maximum(1.0 - np.sum(basis**2, axis=1), 1e-3))
     number = min(MOST_REPLICATES, max(FEWEST_REPLICATES, REPLICATED_READINGS // n))
-    noise = np.random.default_rng(seed).standard_normal((number, n))
+    noise = np.random.default_rng(0).standard_normal((number, n))
 
     def reduced(r: np.ndarray) -> np.ndarray:
         rest = r - (r @ basis) @ basis.T

@@ -39,21 +39,16 @@ class Outlier:
     p: float
 
 
-def moving_symbols(experiment: Experiment) -> list[str]:
-    """Keys of the parameters that change the experiment's prediction (scatters do not)."""
-    return [row.key for row in experiment.parameters if not row.scatter]
-
-
 def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (n,) in units of the noise at the conditional mean of the nuisances, and J (n, p)."""
-    symbols = moving_symbols(experiment)
+    keys = [row.key for row in experiment.parameters if not row.scatter]
 
     def residuals(v: np.ndarray) -> np.ndarray:
-        moved = {**theta, **dict(zip(symbols, v, strict=True))}
+        moved = {**theta, **dict(zip(keys, v, strict=True))}
         return experiment.misfit(moved).raw
 
     misfit = experiment.misfit(theta)
-    sd, at = misfit.sd, np.array([float(theta[s]) for s in symbols])
+    sd, at = misfit.sd, np.array([float(theta[s]) for s in keys])
     raw = jacobian(residuals, at, DIFFERENCE * np.maximum(np.abs(at), 1e-12)) / sd[:, None]
     columns = np.concatenate([raw, misfit.design / sd[:, None]], axis=1)
     size = np.linalg.norm(columns, axis=0)
@@ -71,7 +66,7 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
     known = None if experiment.scale_known else _known_share(experiment, theta)
     keep = np.arange(len(r))
     found: list[Outlier] = []
-    while len(found) < MOST_FLAGGED and len(keep) > (basis := _basis(columns[keep])).shape[1] + 2:
+    while len(found) < MOST_FLAGGED and len(keep) > (basis := basis_of(columns[keep])).shape[1] + 2:
         score, freedom = _studentised(r[keep], basis, None if known is None else known[keep])
         worst = int(np.argmax(np.abs(score)))
         tail = stats.norm.sf(abs(score[worst])) if freedom is None else stats.t.sf(abs(score[worst]), freedom)
@@ -83,7 +78,7 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
     return found
 
 
-def _basis(columns: np.ndarray) -> np.ndarray:
+def basis_of(columns: np.ndarray) -> np.ndarray:
     """(n, rank) orthonormal columns with the span of ``columns`` (n, p).
 
     Columns of nuisances may span those of parameters, as discrepancies do that all trials of a setting share.
@@ -179,13 +174,18 @@ def judged(
     return failed or [Finding(code, "ok", number or {})] * bool(cases)
 
 
-def lag_1(residuals: np.ndarray, seed: int = 0) -> tuple[float, float]:
+def random_orders(values: np.ndarray) -> np.ndarray:
+    """(``PERMUTATIONS``, n) of ``values`` (n,), the same ones each time."""
+    return np.random.default_rng(0).permuted(np.tile(values, (PERMUTATIONS, 1)), axis=1)
+
+
+def lag_1(residuals: np.ndarray) -> tuple[float, float]:
     """Lag-1 correlation of residuals (n,) and the probability that a random order gives as large a one."""
     correlation = float(autocorrelation(residuals, 1)[0])
     n = len(residuals)
     if n > MANY_ROWS:
         return correlation, float(stats.norm.sf(correlation * np.sqrt(n)))
-    shuffled = np.random.default_rng(seed).permuted(np.tile(residuals - np.mean(residuals), (PERMUTATIONS, 1)), axis=1)
+    shuffled = random_orders(residuals - np.mean(residuals))
     random = np.sum(shuffled[:, 1:] * shuffled[:, :-1], axis=1) / np.sum(shuffled**2, axis=1)
     return correlation, float((1 + np.sum(random >= correlation - 1e-12)) / (1 + PERMUTATIONS))
 
@@ -342,11 +342,10 @@ def _of_levels(groups: Sequence[np.ndarray]) -> float:
     return float((stats.alexandergovern if min(scatters) > 0.0 else stats.f_oneway)(*groups).pvalue)
 
 
-def trend(residuals: np.ndarray, load: np.ndarray, seed: int = 0) -> float:
+def trend(residuals: np.ndarray, load: np.ndarray) -> float:
     """Probability that a random order of residuals (n,) has as large a correlation with the logarithm of ``load`` (n,)."""
     x, r = np.log(load) - np.mean(np.log(load)), residuals - np.mean(residuals)
-    shuffled = np.random.default_rng(seed).permuted(np.tile(r, (PERMUTATIONS, 1)), axis=1)
-    return float((1 + np.sum(np.abs(shuffled @ x) >= np.abs(r @ x) * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
+    return float((1 + np.sum(np.abs(random_orders(r) @ x) >= np.abs(r @ x) * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
 
 
 def _within_loads(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
@@ -381,7 +380,7 @@ def _unflagged(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
     return np.delete(residuals, flagged), np.delete(columns, flagged, axis=0)
 
 
-def between(residuals: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float]:
+def between(residuals: Sequence[np.ndarray]) -> tuple[float, float]:
     """Factor of the sd by which tables disagree beyond their scatter, and the probability of as large a disagreement.
 
     The factor is that of the design effect: sqrt(1 + (rows - 1) r), r the correlation of trials of one table.
@@ -404,6 +403,5 @@ def between(residuals: Sequence[np.ndarray], seed: int = 0) -> tuple[float, floa
     rows = (len(values) - float(np.sum(sizes**2)) / len(values)) / (len(sizes) - 1)
     variance = max(0.0, (found / (len(sizes) - 1) - within) / rows)
     correlation = variance / (variance + within) if variance > 0.0 else 0.0
-    shuffled = np.random.default_rng(seed).permuted(np.tile(values, (PERMUTATIONS, 1)), axis=1)
-    p = float((1 + np.sum(sum_between(shuffled) >= found * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
+    p = float((1 + np.sum(sum_between(random_orders(values)) >= found * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
     return float(np.sqrt(1.0 + (rows - 1.0) * correlation)), p

@@ -24,7 +24,7 @@ from capsule_id.inference.checks.posterior import (
 )
 from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, judged, outliers
 from capsule_id.inference.point_fit import residual_jacobian
-from capsule_id.inference.point_stage import SampledFit, Widening
+from capsule_id.inference.point_stage import PHASES, SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.inference.target import LogPosterior
@@ -266,10 +266,15 @@ def widenings(s: SampledFit) -> dict[str, Widening]:
             for name, pair in estimates_of_parts(e, s.values, number, by_load=e.label in by_load):
                 estimates.setdefault(name, []).append(pair)
         for name, pairs in estimates.items():
-            one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
-            if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
-                found[name] = one
+            _keep_widest(found, name, pairs)
     return found
+
+
+def _keep_widest(found: dict[str, Widening], name: str, pairs: Sequence[tuple[float, float]]) -> None:
+    """Enter the widening of the parameter ``name`` by ``pairs`` of enough parts where it is the widest so far."""
+    one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
+    if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
+        found[name] = one
 
 
 def beside_stated(s: SampledFit, found: Mapping[str, Widening]) -> dict[str, Widening]:
@@ -369,8 +374,6 @@ def rows_of_parts(e: Experiment, values: Mapping[str, float], number: int, by_lo
 # between phases only. The widest interval counts.
 
 
-#: Parts of an excitation period. They are long beside most waves of a misfit, so that their steps are independent.
-PHASES = 6
 #: Number of the priors, which every part meets. Without them the step of a parameter that the data leave open has no end.
 PRIORS = -2
 #: Numbers of the parts of the n samples of a record; None where it cannot be divided in this way.
@@ -387,18 +390,14 @@ def record_widenings(s: SampledFit) -> dict[str, Widening]:
     located = np.array([i for i in s.target.located if not is_stated(s.target.names[i])])
     jacobian, residuals = residual_jacobian(s.target, s.fit.u)[:, located], s.target.plain_residuals(s.fit.u)
     informed = {row.name for e in records for row in e.parameters if row.physical}
-    found = {}
+    found: dict[str, Widening] = {}
     for division in (by_time, by_phase):
         part = parts_of_residuals(s, records, division)
         for k, i in enumerate(located.tolist()):
-            name, largest_sd = s.target.names[i], LARGEST_RELATIVE_SD
-            if name not in informed:
-                continue
-            largest_sd *= 1.0 if s.target.positive[i] else abs(s.fit.u[i])
-            pairs = [pair for pair in steps_of_parts(jacobian, residuals, k, part) if pair[1] < largest_sd]
-            one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
-            if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
-                found[name] = one
+            if s.target.names[i] in informed:
+                largest_sd = LARGEST_RELATIVE_SD * (1.0 if s.target.positive[i] else abs(s.fit.u[i]))
+                pairs = [pair for pair in steps_of_parts(jacobian, residuals, k, part) if pair[1] < largest_sd]
+                _keep_widest(found, s.target.names[i], pairs)
     return found
 
 

@@ -14,7 +14,7 @@ from capsule_id.experiments.free_vibration.models import decay as rubbed_decay
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.line import Line, curvature_test
 from capsule_id.experiments.static_friction import tilts as tilted
-from capsule_id.inference.checks.settings import _basis, outliers
+from capsule_id.inference.checks.settings import basis_of, outliers
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.point_stage import SampledFit
@@ -156,6 +156,6 @@ def test_tests_of_lines_keep_their_level(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("columns", "rank"), [(np.zeros((5, 0)), 0), (np.eye(5)[:, [0, 1, 1]], 2)])
 def test_columns_that_depend_on_each_other_count_once(columns: np.ndarray, rank: int) -> None:
-    found = _basis(columns)
+    found = basis_of(columns)
     assert found.shape == (5, rank)
     np.testing.assert_allclose(found @ found.T @ columns, columns, atol=1e-12)

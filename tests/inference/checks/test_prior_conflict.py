@@ -44,14 +44,14 @@ def test_the_distance_is_that_of_prior_and_least_squares() -> None:
     slope, covariance = np.polyfit(CURRENT, experiment.observed, 1, w=np.full(6, 1.0 / FORCE_SD), cov="unscaled")
     value, sd = slope[0], np.sqrt(covariance[0, 0])
     found = conflicts(fitted)["K"]
-    assert (found.value, found.sd) == pytest.approx((value, sd), rel=0.08)  # curvature of the logarithm
-    assert found.z == pytest.approx(np.log(value / 2.0) / np.hypot(sd / value, WIDTH), rel=0.08)
+    assert (found["value"], found["sd"]) == pytest.approx((value, sd), rel=0.08)  # curvature of the logarithm
+    assert found["z"] == pytest.approx(np.log(value / 2.0) / np.hypot(sd / value, WIDTH), rel=0.08)
 
 
 @pytest.mark.full
 def test_the_distance_is_standard_normal_where_prior_and_data_agree() -> None:
     rng = np.random.default_rng(1)
-    z = [conflicts(calibration(rng, 2.0, 2.0 * np.exp(WIDTH * rng.standard_normal())))["K"].z for _ in range(60)]
+    z = [conflicts(calibration(rng, 2.0, 2.0 * np.exp(WIDTH * rng.standard_normal())))["K"]["z"] for _ in range(60)]
     assert stats.kstest(z, "norm").pvalue > 1e-3
     assert max(np.abs(z)) < 3.5
 
