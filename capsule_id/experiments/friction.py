@@ -80,11 +80,12 @@ def check_load(entry: Entry[Any]) -> None:
     table = entry.table
     needed = has_stated_load(table) and "force" in table.columns and "slope" in table.settings.ground
     if needed and table.settings.load_is is None:
-        rule = "load_is must say where a stated normal force on a slope comes from"
-        remedy = (
-            'write load_is = "weight" for weights on the capsule, or load_is = "pressed" for a force without weight'
+        raise entry.error(
+            "",
+            "load_is must say where a stated normal force on a slope comes from",
+            "none",
+            'write load_is = "weight" for weights on the capsule, or load_is = "pressed" for a force without weight',
         )
-        raise entry.error("", rule, "none", remedy)
     if table.settings.load_is is not None and not needed:
         raise entry.error("load_is", "load_is needs a slope and a stated normal force", "no such", "remove it", True)
 
@@ -161,9 +162,12 @@ def check_scatter(tables: Sequence[Table[Any]]) -> None:
     if len(rows) < 2 or np.any(rows != rows[0]):
         return
     if not any(column.reading_sd > 0.0 for table in tables for column in table.columns.values()):
-        name = next(iter(tables[0].columns))
-        rule = f"{tables[0].kind} readings that are all the same need their reading step"
-        raise InputError(rule, counted(len(rows), "row"), f"state {name}_resolution", tables[0].file)
+        raise InputError(
+            f"{tables[0].kind} readings that are all the same need their reading step",
+            counted(len(rows), "row"),
+            f"state {next(iter(tables[0].columns))}_resolution",
+            tables[0].file,
+        )
 
 
 # paper: The paper's estimate of eq. (1), and its panel: coefficient against velocity (Fig. 2).
@@ -386,9 +390,13 @@ class Pulls(FrictionExperiment):
         force, along = self.observed, np.broadcast_to(self.stated_along, self.n)
         if "slope" in self.ground and np.all(force <= along):
             row = int(np.argmax(force - along))
-            rule = f"a force must exceed the weight along the slope, {along[row]:.4g} N"
-            remedy = "correct slope, direction or load_is"
-            raise InputError(rule, f"{force[row]:.4g} N", remedy, table.file, int(table.rows[row]))
+            raise InputError(
+                f"a force must exceed the weight along the slope, {along[row]:.4g} N",
+                f"{force[row]:.4g} N",
+                "correct slope, direction or load_is",
+                table.file,
+                int(table.rows[row]),
+            )
 
     def read(self, table: Table) -> tuple[dict[str, Any], dict[str, Any]]:
         readings, sds = super().read(table)

@@ -73,23 +73,38 @@ class FrictionModel:
     def __post_init__(self) -> None:
         law, wanted = self.law, ("parameters", "forward", "backward")
         if not isinstance(law, type) or not all(hasattr(law, name) for name in wanted):
-            rule = "friction must be a class with parameters, forward(speed) and backward(speed)"
-            raise InputError(rule, repr(law), "give the class itself; see capsule_id.physics.friction.FrictionLaw")
+            raise InputError(
+                "friction must be a class with parameters, forward(speed) and backward(speed)",
+                repr(law),
+                "give the class itself; see capsule_id.physics.friction.FrictionLaw",
+            )
         for row in law.parameters:
             if row.symbol == NORMAL_FORCE and (row.prior is not None or row.sampled):
-                rule = f"a leaf N of the friction law {law.__name__} holds the weight, N, and is not sampled"
-                raise InputError(rule, row.meaning, "give the row no prior and sampled=False, or rename the leaf")
+                raise InputError(
+                    f"a leaf N of the friction law {law.__name__} holds the weight, N, and is not sampled",
+                    row.meaning,
+                    "give the row no prior and sampled=False, or rename the leaf",
+                )
             if row.symbol != NORMAL_FORCE and (row.prior is None or not row.sampled):
-                rule = f"every parameter of the friction law {law.__name__} must have a default prior"
-                raise InputError(rule, f"{row.symbol} has none", f"give Parameter({row.symbol!r}, ...) a prior")
+                raise InputError(
+                    f"every parameter of the friction law {law.__name__} must have a default prior",
+                    f"{row.symbol} has none",
+                    f"give Parameter({row.symbol!r}, ...) a prior",
+                )
         try:
             leaves = jax.tree.leaves(self._at({row.symbol: _prior_of(row).median for row in self.parameters}, 1.0))
         except TypeError as error:
-            rule = f"the friction law {law.__name__} must have one row of parameters per field"
-            raise InputError(rule, str(error), "give every field a row with the field's name as its symbol") from None
+            raise InputError(
+                f"the friction law {law.__name__} must have one row of parameters per field",
+                str(error),
+                "give every field a row with the field's name as its symbol",
+            ) from None
         if len(leaves) != len(law.parameters) or any(isinstance(leaf, law) for leaf in leaves):
-            rule = f"the friction law {law.__name__} must be a pytree whose leaves are its parameters"
-            raise InputError(rule, f"leaves: {len(leaves)}", "add @jax.tree_util.register_dataclass above @dataclass")
+            raise InputError(
+                f"the friction law {law.__name__} must be a pytree whose leaves are its parameters",
+                f"leaves: {len(leaves)}",
+                "add @jax.tree_util.register_dataclass above @dataclass",
+            )
 
     @property
     def name(self) -> str:
@@ -153,8 +168,11 @@ class FrictionModel:
         """
         for row in self.parameters:
             if known.get(row.symbol, row) != row:
-                rule = f"a parameter of the friction law {self.law.__name__} must have a symbol of its own"
-                raise InputError(rule, f"{row.symbol}: {known[row.symbol].meaning}", "rename it")
+                raise InputError(
+                    f"a parameter of the friction law {self.law.__name__} must have a symbol of its own",
+                    f"{row.symbol}: {known[row.symbol].meaning}",
+                    "rename it",
+                )
 
     def force(self, theta: ValuesBySymbol) -> FrictionLaw:
         """The law at ``theta``, N; theta has m1, m2, g and, off level ground, slope and N0; or N."""
@@ -221,8 +239,12 @@ def friction_of(rig: Rig, law: type[FrictionLaw] | None = None) -> FrictionModel
     if law is None:
         return FrictionModel(free=free, constant=rig.model.friction == "constant")
     if free or rig.model.friction != ModelChoices().friction:
-        rule, remedy = "a friction law of its own replaces [model]", "remove friction and free from [model]"
-        raise InputError(rule, f"both {law.__name__} and [model]", remedy, rig.folder / "rig.toml")
+        raise InputError(
+            "a friction law of its own replaces [model]",
+            f"both {law.__name__} and [model]",
+            "remove friction and free from [model]",
+            rig.folder / "rig.toml",
+        )
     return FrictionModel(law)
 
 

@@ -201,14 +201,15 @@ def _not_finite(target: LogPosterior, fit: LeastSquaresFit, starts: int) -> Inpu
     names = [target.names[i] for i, finite in zip(target.located, columns, strict=True) if not finite]
     alone = "fit the bench alone (--experiments bench)"
     if names and np.isfinite(fit.residuals).all():
-        rule, value = (
+        return InputError(
             "every motion must have finite derivatives",
             f"the motion is finite, its derivative is not: {', '.join(names)}",
+            f"state a prior of {' and '.join(names)} with another median, or {alone}",
         )
-        return InputError(rule, value, f"state a prior of {' and '.join(names)} with another median, or {alone}")
-    rule = "bench and runs are fitted from a start at which every motion is finite"
     return InputError(
-        rule, f"none in {counted(starts, 'start')}", f"check masses, gaps and settings of the runs, or {alone}"
+        "bench and runs are fitted from a start at which every motion is finite",
+        f"none in {counted(starts, 'start')}",
+        f"check masses, gaps and settings of the runs, or {alone}",
     )
 
 

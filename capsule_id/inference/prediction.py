@@ -92,8 +92,14 @@ def _check_settings(fitted: Table, columns: dict[str, Column], path: Path) -> No
     drive = {"duty", "P_on", "P_d", "current"}
     wanted, given = drive & set(fitted.columns), drive & set(columns)
     if wanted != given:
-        rule = f"the settings must have the drive columns of {fitted.label}: {' '.join(sorted(wanted)) or 'none'}"
-        raise InputError(rule, " ".join(sorted(given)) or "none", "add or remove columns", path, 1, 1)
+        raise InputError(
+            f"the settings must have the drive columns of {fitted.label}: {' '.join(sorted(wanted)) or 'none'}",
+            " ".join(sorted(given)) or "none",
+            "add or remove columns",
+            path,
+            1,
+            1,
+        )
 
 
 # importance: Importance weights: evidence of a model by bridge sampling (Meng & Wong 1996), and Pareto smoothing.

@@ -284,8 +284,11 @@ class RodMotion(_Lines):
 
         t, x = np.asarray(times, float), np.asarray(X1, float)
         if t.ndim != 1 or len(t) < 2 or x.shape[-1:] != t.shape or not (np.isfinite(t).all() and np.isfinite(x).all()):
-            rule = "a recorded motion needs two or more finite times, and a finite position for each"
-            raise InputError(rule, f"shapes {t.shape} and {x.shape}", "remove what is not finite")
+            raise InputError(
+                "a recorded motion needs two or more finite times, and a finite position for each",
+                f"shapes {t.shape} and {x.shape}",
+                "remove what is not finite",
+            )
         if not np.all(np.diff(t) > 0.0):
             raise InputError(
                 "times must increase", "found a step that is not positive", "sort them, drop repeated ones"

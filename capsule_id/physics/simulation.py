@@ -27,8 +27,11 @@ def _check_choices(model: str, semantics: str, smoothing: Smoothing | None) -> N
     if semantics not in ("stick-slip", "eq2"):
         raise InputError('semantics must be "stick-slip" or "eq2"', repr(semantics), "choose one of the two")
     if model == "exact" and semantics == "eq2":
-        remedy = 'use model="smooth" for eq. (2) to the letter'
-        raise InputError("the exact model has stick-slip semantics only", 'semantics="eq2"', remedy)
+        raise InputError(
+            "the exact model has stick-slip semantics only",
+            'semantics="eq2"',
+            'use model="smooth" for eq. (2) to the letter',
+        )
     if model == "exact" and smoothing is not None:
         raise InputError("the exact model has no smoothing", repr(smoothing), 'leave it out or use model="smooth"')
 
@@ -38,13 +41,19 @@ def _check_values(p: CapsuleParameters, e: Drive, law: FrictionLaw, times: np.nd
     carried = np.asarray(pressed(p, law))
     if isinstance(law, CoulombStribeck) and not (carried | np.isnan(law.N)).all():
         N = float(np.asarray(law.N)[~carried & ~np.isnan(law.N)][0])
-        rule = "the normal force (m1 + m2) g cos(slope) + N0 must be positive"
-        raise InputError(rule, f"N = {N:.3g} N", "reduce the slope, or raise N0")
+        raise InputError(
+            "the normal force (m1 + m2) g cos(slope) + N0 must be positive",
+            f"N = {N:.3g} N",
+            "reduce the slope, or raise N0",
+        )
     covered = np.asarray(e.covers(times[:, 0], times[:, -1]))
     if not covered.all():
         begin, end = times[~covered][0, [0, -1]]
-        rule = f"the drive {type(e).__name__} must cover the run, and its own times must increase"
-        raise InputError(rule, f"times from {begin:g} to {end:g} s", "shorten the run, or correct the drive")
+        raise InputError(
+            f"the drive {type(e).__name__} must cover the run, and its own times must increase",
+            f"times from {begin:g} to {end:g} s",
+            "shorten the run, or correct the drive",
+        )
 
 
 def simulate(

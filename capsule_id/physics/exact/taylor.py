@@ -131,8 +131,11 @@ def on_series(force: Force, d: Taylor, w: Taylor) -> Taylor:
     try:
         found = force.side * (force.elastic(d) + force.damping(d, force.side * w))
     except TypeError:
-        rule = "the exact engine takes forces made of +, - and * and whole powers (int) of d and w only"
-        raise InputError(rule, f"the formulas of {type(force).__name__}", 'use simulate with model="smooth"') from None
+        raise InputError(
+            "the exact engine takes forces made of +, - and * and whole powers (int) of d and w only",
+            f"the formulas of {type(force).__name__}",
+            'use simulate with model="smooth"',
+        ) from None
     return found if isinstance(found, Taylor) else Taylor(lambda k: found if k == 0 else 0.0, d.unit)
 
 
@@ -225,9 +228,11 @@ def constants_of(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> Constants:
         A force of the user's own on a prescribed rod: no series of a motion would show where that of the force ends.
     """
     if p.forces and e.prescribed:
-        rule = "the exact engine takes no further forces where the motion of the rod is prescribed"
-        value = ", ".join(type(force).__name__ for force in p.forces)
-        raise InputError(rule, value, 'use simulate with model="smooth"')
+        raise InputError(
+            "the exact engine takes no further forces where the motion of the rod is prescribed",
+            ", ".join(type(force).__name__ for force in p.forces),
+            'use simulate with model="smooth"',
+        )
     m1, m2 = jnp.asarray(p.m1), jnp.asarray(p.m2)
     still = jnp.zeros_like(m1)
     F_forward, F_backward = (jnp.broadcast_to(F, still.shape) for F in (law.forward(still), law.backward(still)))
