@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from capsule_id.commands import PATH
+from capsule_id.commands import NO_CACHE, PATH
 from capsule_id.commands.capsule_options import (
     DEFAULTS,
     capsule_and_drive,
@@ -22,7 +22,7 @@ from capsule_id.commands.capsule_options import (
     leaves_of,
     number,
 )
-from capsule_id.commands.compilation import add_cache_argument, prepare_jax
+from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import Progress, complain, saved, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
@@ -139,18 +139,12 @@ MOST_POINTS = 10_000_000
 
 @dataclass(frozen=True)
 class Axis:
-    """A varied quantity: values from begin to end in ``unit``, SI = value * factor."""
+    """A varied quantity: ``values`` (points,) in SI (f in Hz), and the unit that they are drawn in, of ``factor`` SI."""
 
     name: str
-    begin: float
-    end: float
-    points: int
+    values: np.ndarray
     unit: str
     factor: float
-
-    def values(self) -> np.ndarray:
-        """(points,), SI (f in Hz)."""
-        return np.linspace(self.begin, self.end, self.points) * self.factor
 
 
 _OVER = {"choices": tuple(SWEPT)}
@@ -186,7 +180,7 @@ OPTIONS = {
         ("--resume", "", "reuse the finished blocks of an interrupted map"),
         ("--quiet", "", "no progress on standard error"),
         ("--out", "FILE", "FILE.nc; the figure is FILE.png (default results/<rig>-<quantity>.nc)", PATH),
-        add_cache_argument,
+        NO_CACHE,
     ),
 }
 
@@ -280,7 +274,7 @@ def _dataset(
         given = {name for name in LEAVES if getattr(args, name) is not None}
         leaves |= {name: column for name, column in draws.items() if name not in given}
     p, e = capsule_and_drive(leaves, args.drive)
-    x = {axis.name: axis.values() for axis in axes}
+    x = {axis.name: axis.values for axis in axes}
     (over, grid), *_ = x.items()
     if args.posterior is not None:
         return sweep.bands(sweep.draws_diagram(p, e, over, grid, settling=settling, **work))
@@ -306,7 +300,7 @@ def _measured_points(
     if not diagram or not rig.has_runs:
         return ()
     by_name = args.spring if args.k2 is None else None
-    motions, sentence = overlay(rig, axes[0].name, axes[0].values(), values, fitted_values(args.result), by_name)
+    motions, sentence = overlay(rig, axes[0].name, axes[0].values, values, fitted_values(args.result), by_name)
     complain(sentence)
     return motions
 
@@ -343,7 +337,7 @@ def _axis(prefix: str, name: str, begin: str, end: str, unit: str | None, points
         raise InputError(f"{name} must be positive", f"--{prefix}from {low:g}", "begin above 0")
     if SWEPT[name].sign == "not negative" and low < 0.0:
         raise InputError(f"{name} must not be negative", f"--{prefix}from {low:g}", "begin at 0 or above")
-    return Axis(name, low, high, n, unit if unit is not None else si, factor)
+    return Axis(name, np.linspace(low, high, n) * factor, si if unit is None else unit, factor)
 
 
 def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:

@@ -6,7 +6,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import groupby, islice, pairwise, product
+from itertools import chain, groupby, islice, pairwise, product
 from pathlib import Path
 from typing import Literal
 
@@ -299,29 +299,16 @@ def _cells_of_row(line: str, layout: Layout) -> Cells:
 
 def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
     """The layout with the markers alone that occur in the ``used`` columns."""
-    read = EXPORTS[suffix_of(found.export.path)]
-
-    def reads(markers: tuple[str, ...]) -> bool:
-        try:
-            export = read(content, found.export.path, replace(found.layout, missing=markers))
-            for column in used:
-                export.values(column)
-        except InputError:
-            return False
-        return True
-
-    suffix = suffix_of(found.export.path).removesuffix(COMPRESSED)
-    text = TextFile(content, found.export.path) if suffix in TEXTS else None
-    known = ("NaN",) if text is None and suffix != ".xlsx" else MARKERS
-    missing = tuple(marker for marker in known if text is None or text.has_cell(marker))
-    gaps = any(np.isnan(found.columns[column]).any() for column in used)
-    if not gaps and reads(()):
+    path, numbers = found.export.path, tuple(index + 1 for index in used)
+    missing: tuple[str, ...] = ("NaN",)
+    if not any(np.isnan(found.columns[index]).any() for index in used):
         missing = ()
-    if gaps and len(missing) == 1:  # a long file takes seconds to read
-        return replace(found.layout, missing=missing)
-    for marker in missing:
-        fewer = tuple(each for each in missing if each != marker)
-        missing = fewer if reads(fewer) else missing
+    elif suffix_of(path).removesuffix(COMPRESSED) in TEXTS or suffix_of(path) == ".xlsx":
+        export = EXPORTS[suffix_of(path)](content, path, replace(found.layout, columns=numbers, words=numbers))
+        columns = [export.words(index).tolist() for index in used] if export.words else []
+        everything = (re.split("[\t,]", line) for line in TextFile(content, path).lines())  # of a LabVIEW file
+        cells = set(chain.from_iterable(columns or everything))
+        missing = tuple(marker for marker in MARKERS if marker in cells)
     return replace(found.layout, missing=missing)
 
 

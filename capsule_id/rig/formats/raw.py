@@ -148,11 +148,6 @@ class TextFile:
                 raise InputError(rule, "a longer one", remedy, self.path, self._text.count(b"\n", 0, begin) + 1, 1)
             begin = end
 
-    def has_cell(self, text: str) -> bool:
-        """Whether a text stands between any two separators, or at the beginning or the end of a line."""
-        pattern = rb'(?:^|[,;\t ])"?%s"?(?:$|[,;\t ])' % re.escape(text.encode())
-        return re.search(pattern, self._text.rstrip(b"\n"), re.MULTILINE) is not None
-
     def blocks(self, first: int = 0) -> Iterator[tuple[int, bytes]]:
         """Blocks of lines from line ``first``, counted from 0: the number of their first line, and their text in UTF-8.
 
