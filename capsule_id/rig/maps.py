@@ -280,20 +280,17 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
         if (rate := source.rate) is not None:
             values[name] = np.arange(first_rows[-1]) / rate
     names = tuple(column_map.sources)
-    origin = None if keep is None else np.flatnonzero(keep)
-    columns = tuple(values[name] if keep is None else values.pop(name)[keep] for name in names)
 
     def place(row: int | None, column: int) -> Place:
-        index = 0 if row is None else row if origin is None else int(origin[row])
-        part = 0 if row is None else int(np.searchsorted(first_rows, index, side="right")) - 1
+        part = 0 if row is None else int(np.searchsorted(first_rows, row, side="right")) - 1
         here = places[part].get(names[column]) or next(iter(places[part].values()))
-        return here(None if row is None else index - int(first_rows[part]))
+        return here(None if row is None else row - int(first_rows[part]))
 
     # Arrays of a file may have other lengths than those that the map names.
-    lines = first.lines[: int(first_rows[-1])]
-    rows = np.arange(1, 1 + len(columns[0])) if len(parts) > 1 else lines if keep is None else lines[keep]
+    rows = np.arange(1, 1 + int(first_rows[-1])) if len(parts) > 1 else first.lines[: int(first_rows[-1])]
     units = tuple(column_map.sources[name].unit for name in names)
-    return RawTable(names, units, columns, rows, place, missing=missing, other=other)
+    raw = RawTable(names, units, tuple(values[name] for name in names), rows, place, missing=missing, other=other)
+    return raw if keep.all() else raw.taken(np.flatnonzero(keep))
 
 
 class _Part:
@@ -427,8 +424,8 @@ def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.n
 
 def _kept(
     node: Node, values: Mapping[str, np.ndarray], where: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray | None, int, int]:
-    """Which rows are used (None: all), and how many are dropped: for a missing cell, and outside ``where``."""
+) -> tuple[np.ndarray, int, int]:
+    """Which rows are used, and how many are dropped: for a missing cell, and outside ``where``."""
     everything = np.ones(next(iter(values.values())).size, bool)
     inside = np.all([everything, *(rows for rows, _ in where)], axis=0)
     unknown = np.any([~everything, *(rows for _, rows in where)], axis=0)
@@ -437,4 +434,4 @@ def _kept(
     if not keep.any():
         raise node.error("a table must have rows", "none is left", "correct where, or map another column")
     missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
-    return None if keep.all() else keep, missing, keep.size - int(np.sum(keep)) - missing
+    return keep, missing, keep.size - int(np.sum(keep)) - missing
