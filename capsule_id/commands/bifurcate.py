@@ -28,7 +28,6 @@ from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
 from capsule_id.output import NEW, PARTIAL, check_parents, replace_files
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
-from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.units import UnitError, factor_to_si
 from capsule_id.views import counted
@@ -209,6 +208,7 @@ def run(args: argparse.Namespace) -> int:
     out = default if args.out is None else args.out
     store = prepare_store(out, args.resume)
     prepare_jax(not args.no_cache)
+    from capsule_id.commands.measured_runs import overlay
     from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.report.figures.style import own_style, png
     from capsule_id.report.write import netcdf_bytes
@@ -218,7 +218,12 @@ def run(args: argparse.Namespace) -> int:
         if "x_rel" in data and all(axis.name != "G" for axis in axes):
             warn_of_far_gap(values["G"], data["x_rel"])
         data.attrs["rig"] = rig.name if rig is not None else ""
-        measured = _measured_points(args, rig, axes, values) if rig is not None else ()
+        measured: Sequence[MeasuredPoint] = ()
+        diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
+        if rig is not None and rig.has_runs and diagram:
+            by_name, fitted = args.spring if args.k2 is None else None, fitted_values(args.result)
+            measured, sentence = overlay(rig, axes[0].name, axes[0].values, values, fitted, by_name)
+            complain(sentence)
         with own_style():
             figure = png(draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
         with refusing("the output must be writable", "choose another --out", out):
@@ -288,21 +293,6 @@ def _dataset(
         return sweep.diagram(p, e, over, grid, starts=starts, **plain)
     directions = ("forward", "backward") if args.method == "both" else (args.method,)
     return sweep.continuation(p, e, over, grid, directions=directions, **plain)
-
-
-def _measured_points(
-    args: argparse.Namespace, rig: Rig, axes: Sequence[Axis], values: dict[str, float]
-) -> "Sequence[MeasuredPoint]":
-    """The forced runs with the settings of a diagram. Standard error lists the omitted runs."""
-    from capsule_id.commands.measured_runs import overlay
-
-    diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
-    if not diagram or not rig.has_runs:
-        return ()
-    by_name = args.spring if args.k2 is None else None
-    motions, sentence = overlay(rig, axes[0].name, axes[0].values, values, fitted_values(args.result), by_name)
-    complain(sentence)
-    return motions
 
 
 def _axes(args: argparse.Namespace) -> tuple[Axis, ...]:
