@@ -24,7 +24,6 @@ from capsule_id.parameters import Name, is_stated, symbol_of
 from capsule_id.records.motion import UNDECIDED
 from capsule_id.report.columns import (
     MISSING,
-    Row,
     SampledParameters,
     fixed,
     printed_table,
@@ -230,7 +229,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
     tables = select_tables(result.rig, result.provenance.experiments)
     return _ENVIRONMENT.get_template("report.html.j2").render(
         result=result,
-        answers=[(row, _truth(row, result.truth.get(row.name))) for row in stated_last],
+        answers=stated_last,
         steps=next_steps(result),
         skewed=skewed_names(result.summary),
         experiments=_experiments(result, [picture for picture in pictures if picture.section == "measured"]),
@@ -251,15 +250,6 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
         fitted=Counter(table.kind.replace("_", " ") for table in tables),
         latex=latex_table(result),
     )
-
-
-def _truth(row: Row, truth: float | None) -> str:
-    """The true value of a synthetic rig, and how far the estimate is from it."""
-    known = MISSING if truth is None else fixed(truth * row.scale, row.decimals)
-    sd = float(row.values["sd"])
-    if truth is not None and sd > 0.0:
-        known += f" ({(float(row.values['value']) - truth) / sd:+.1f} sd)".replace("-", "−")
-    return known
 
 
 def _experiments(result: Result, measured: Sequence[Picture]) -> list[dict[str, object]]:
@@ -322,6 +312,7 @@ _ENVIRONMENT = Environment(
 )
 _ENVIRONMENT.filters |= {
     "symbol_parts": symbol_parts,
+    "fixed": fixed,
     "number": _number,
     "embed": lambda picture: "data:image/png;base64," + base64.b64encode(picture.png).decode("ascii"),
     "after_number": after_number,
@@ -427,13 +418,12 @@ def _factor(remaining: float) -> str:
 
 
 #: The paper whose model and rig this package fits.
-AUTHORS = ("Yang Liu", "Ekaterina Pavlovskaia", "Marian Wiercigroch")
+NAMES = "Yang Liu, Ekaterina Pavlovskaia and Marian Wiercigroch"
 TITLE = "Experimental verification of the vibro-impact capsule model"
 JOURNAL, VOLUME, YEAR, PAGES = "Nonlinear Dynamics", 83, 2016, (1029, 1041)
 PUBLISHED = f"{JOURNAL} {VOLUME} ({YEAR}) {PAGES[0]}–{PAGES[1]}"
-NAMES = f"{', '.join(AUTHORS[:-1])} and {AUTHORS[-1]}"
 PAPER = {
-    "author": " and ".join(f"{name.rpartition(' ')[2]}, {name.rpartition(' ')[0]}" for name in AUTHORS),
+    "author": "Liu, Yang and Pavlovskaia, Ekaterina and Wiercigroch, Marian",
     "title": TITLE,
     "journal": JOURNAL,
     "volume": VOLUME,

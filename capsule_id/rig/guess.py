@@ -16,9 +16,9 @@ from scipy.optimize import linear_sum_assignment
 from capsule_id.errors import InputError, printable
 from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
-from capsule_id.rig.formats.layouts import delimiter_of, is_number
+from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
 from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile
-from capsule_id.rig.formats.text import bare, is_row, texts_of
+from capsule_id.rig.formats.text import is_row
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
 
@@ -292,7 +292,7 @@ def _runs(lines: Iterable[str], layout: Layout) -> tuple[list[tuple[Cells, list[
 def _cells_of_row(line: str, layout: Layout) -> Cells:
     """Separator and number of cells of a line that begins with a number, or a missing one before others; else None."""
     delimiter = delimiter_of(line, layout)
-    texts = [bare(cell) for cell in texts_of(line, delimiter)]
+    texts = split_bare(line, delimiter)
     begins = is_number(texts[0]) or (texts[0] in layout.missing and any(map(is_number, texts)))
     return (delimiter, len(texts)) if begins else None
 
