@@ -292,7 +292,7 @@ class _Evidence:
             parts.append(
                 self._log_evidence(levels[0], np.geomspace(*PART, _GRID)) + np.log(np.sum(prior[self._longest :]))
             )
-        posterior = np.exp(parts - logsumexp(parts))
+        posterior = np.exp(np.array(parts) - np.asarray(logsumexp(parts)))
         return np.pad(posterior[: self._longest + 1], (0, LONGEST_PERIOD - self._longest))
 
     def _log_evidence(
