@@ -31,7 +31,7 @@ from capsule_id.inference.pipeline import (
     unfinished,
 )
 from capsule_id.inference.point_stage import fit_points
-from capsule_id.inference.prediction import DRAWS, predict
+from capsule_id.inference.prediction import DRAWS, predict, random_draws
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
@@ -114,9 +114,13 @@ class Fit(Result):
         synthetic = ", synthetic" if self.rig.synthetic else ""
         return f"<Fit of {self.rig.name}{synthetic}: {self.trust}; {', '.join(shown[:SHOWN_PARAMETERS])}{more}>"
 
+    @property
+    def table(self) -> str:
+        """The parameter table with the remarks under it, as the console shows them."""
+        return "\n".join([table_text(self.summary, synthetic=self.rig.synthetic), *wrapped(self.remarks)])
+
     def __str__(self) -> str:
-        table = table_text(self.summary, synthetic=self.rig.synthetic)
-        return "\n".join([table, *wrapped(self.remarks), self.verdict])
+        return f"{self.table}\n{self.verdict}"
 
     def _repr_html_(self) -> str:
         return summary_html(self, self.verdict, self.remarks)
@@ -169,7 +173,7 @@ class Fit(Result):
         InputError
             If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter or the gap is missing.
         """
-        chosen = self._draws(draws, seed)
+        chosen = random_draws(self, draws, np.random.default_rng(seed))
         rig = {name: getattr(self.rig, name) for name in ("m1", "m2", "g", "slope", "N0")}
         stated = {name: quantity.value for name, quantity in rig.items() if quantity is not None}
         values = {**stated, **self.fixed, "k2": 0.0, "G": gap, **chosen, **(given or {})}
@@ -191,16 +195,6 @@ class Fit(Result):
         motion = simulate(p, drive, times)
         warn_of_far_gap(p.G, motion.x_rel)
         return motion
-
-    def _draws(self, number: int, seed: int) -> dict[str, np.ndarray]:
-        """``number`` draws at random: name -> (number,), SI."""
-        if self.posterior is None:
-            raise InputError("draws need a sample", "the point fit alone", "fit without --no-sample (budget=None)")
-        flat = self.posterior.draws.reshape(-1, len(self.posterior.names))
-        if not 1 <= number <= len(flat):
-            raise InputError("draws must lie between 1 and the sample's", str(number), f"give at most {len(flat)}")
-        chosen = np.random.default_rng(seed).choice(len(flat), number, replace=False)
-        return dict(zip(self.posterior.names, flat[chosen].T, strict=True))
 
     def predict(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> pd.DataFrame:
         """Predict a new trial in a new session at each row of a table; see ``capsule_id.inference.prediction``."""
@@ -226,8 +220,7 @@ class Fit(Result):
 
     def plot_record(self, name: str | None = None, ax: Axes | None = None) -> Figure:
         """Channels of a recorded run and its phase plane, several panels in the place of ``ax``: the figure."""
-        view = _named(self.records, name, "name").view
-        return _drawn_in_panels(figures.overview, view, ax, *figures.overview_size(view))
+        return _drawn_in_panels(figures.overview, figures.overview_size, _named(self.records, name, "name").view, ax)
 
     def plot_force(self, name: str | None = None, ax: Axes | None = None) -> Axes:
         """Force on the rod from the recorded current, and the fitted drive."""
@@ -236,13 +229,11 @@ class Fit(Result):
 
     def plot_corner(self, ax: Axes | None = None) -> Figure:
         """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair, in the place of ``ax``: the figure."""
-        columns = sampled_parameters(self)
-        return _drawn_in_panels(figures.corner, columns, ax, *figures.corner_size(columns))
+        return _drawn_in_panels(figures.corner, figures.corner_size, sampled_parameters(self), ax)
 
     def plot_traces(self, ax: Axes | None = None) -> Figure:
         """A few walkers of each ensemble against the step, several panels in the place of ``ax``: the figure."""
-        columns = sampled_parameters(self)
-        return _drawn_in_panels(figures.traces, columns, ax, *figures.traces_size(columns))
+        return _drawn_in_panels(figures.traces, figures.traces_size, sampled_parameters(self), ax)
 
     def plot_starts(self, ax: Axes | None = None) -> Axes:
         """Where each start of the point fit began and ended, in standard deviations."""
@@ -327,10 +318,10 @@ def _drawn(
 
 
 def _drawn_in_panels(
-    draw: Callable[[Any, SubFigure], None], data: object, ax: Axes | None, width: float, height: float
+    draw: Callable[[Any, SubFigure], None], size: Callable[[Any], tuple[float, float]], data: object, ax: Axes | None
 ) -> Figure:
-    """The figure with several panels of ``data`` in the place of ``ax``, or a new pyplot figure."""
-    part = subfigure_at(ax or _new_axes(width, height, None))
+    """The figure with several panels of ``data`` in the place of ``ax``, or a new pyplot figure of their ``size``."""
+    part = subfigure_at(ax or _new_axes(*size(data), None))
     draw(data, part)
     return part.figure
 

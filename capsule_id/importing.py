@@ -215,8 +215,7 @@ def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | Non
     if rows < FEWEST_SAMPLES or len(times) > 1 or len(channels) != 1:
         return None
     reason = "no header names the column"
-    dimensions = sorted({rule.si for kind in kinds.values() for rule in kind.columns.values()})
-    candidates = []
+    dimensions, candidates = dimensions_of(kinds), []
     for kind in (kind for kind in kinds.values() if TIME in kind.columns):
         names = [name for name in (*kind.sets[0], *kind.channels) if name != TIME]
         wanted = [(channels[0], names), *((index, [TIME]) for index in times)]
@@ -235,7 +234,7 @@ def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | Non
 
 
 def _first_with_unit(
-    found: FoundLayout, index: int, names: list[str], kind: Kind, dimensions: list[str]
+    found: FoundLayout, index: int, names: list[str], kind: Kind, dimensions: Sequence[str]
 ) -> tuple[str, str] | None:
     """The first of the ``names`` that the unit in the file allows, and that unit."""
     text = found.header(index, dimensions)[1]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from capsule_id.commands import PATH
+from capsule_id.commands import NO_CACHE, PATH
 from capsule_id.commands.capsule_options import (
     DEFAULTS,
     capsule_and_drive,
@@ -22,13 +22,12 @@ from capsule_id.commands.capsule_options import (
     leaves_of,
     number,
 )
-from capsule_id.commands.compilation import add_cache_argument, prepare_jax
+from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import Progress, complain, saved, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
 from capsule_id.output import NEW, PARTIAL, check_parents, replace_files
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
-from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.units import UnitError, factor_to_si
 from capsule_id.views import counted
@@ -139,18 +138,12 @@ MOST_POINTS = 10_000_000
 
 @dataclass(frozen=True)
 class Axis:
-    """A varied quantity: values from begin to end in ``unit``, SI = value * factor."""
+    """A varied quantity: ``values`` (points,) in SI (f in Hz), and the unit that they are drawn in, of ``factor`` SI."""
 
     name: str
-    begin: float
-    end: float
-    points: int
+    values: np.ndarray
     unit: str
     factor: float
-
-    def values(self) -> np.ndarray:
-        """(points,), SI (f in Hz)."""
-        return np.linspace(self.begin, self.end, self.points) * self.factor
 
 
 _OVER = {"choices": tuple(SWEPT)}
@@ -186,7 +179,7 @@ OPTIONS = {
         ("--resume", "", "reuse the finished blocks of an interrupted map"),
         ("--quiet", "", "no progress on standard error"),
         ("--out", "FILE", "FILE.nc; the figure is FILE.png (default results/<rig>-<quantity>.nc)", PATH),
-        add_cache_argument,
+        NO_CACHE,
     ),
 }
 
@@ -215,6 +208,7 @@ def run(args: argparse.Namespace) -> int:
     out = default if args.out is None else args.out
     store = prepare_store(out, args.resume)
     prepare_jax(not args.no_cache)
+    from capsule_id.commands.measured_runs import overlay
     from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.report.figures.style import own_style, png
     from capsule_id.report.write import netcdf_bytes
@@ -224,7 +218,12 @@ def run(args: argparse.Namespace) -> int:
         if "x_rel" in data and all(axis.name != "G" for axis in axes):
             warn_of_far_gap(values["G"], data["x_rel"])
         data.attrs["rig"] = rig.name if rig is not None else ""
-        measured = _measured_points(args, rig, axes, values) if rig is not None else ()
+        measured: Sequence[MeasuredPoint] = ()
+        diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
+        if rig is not None and rig.has_runs and diagram:
+            by_name, fitted = args.spring if args.k2 is None else None, fitted_values(args.result)
+            measured, sentence = overlay(rig, axes[0].name, axes[0].values, values, fitted, by_name)
+            complain(sentence)
         with own_style():
             figure = png(draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
         with refusing("the output must be writable", "choose another --out", out):
@@ -280,7 +279,7 @@ def _dataset(
         given = {name for name in LEAVES if getattr(args, name) is not None}
         leaves |= {name: column for name, column in draws.items() if name not in given}
     p, e = capsule_and_drive(leaves, args.drive)
-    x = {axis.name: axis.values() for axis in axes}
+    x = {axis.name: axis.values for axis in axes}
     (over, grid), *_ = x.items()
     if args.posterior is not None:
         return sweep.bands(sweep.draws_diagram(p, e, over, grid, settling=settling, **work))
@@ -294,21 +293,6 @@ def _dataset(
         return sweep.diagram(p, e, over, grid, starts=starts, **plain)
     directions = ("forward", "backward") if args.method == "both" else (args.method,)
     return sweep.continuation(p, e, over, grid, directions=directions, **plain)
-
-
-def _measured_points(
-    args: argparse.Namespace, rig: Rig, axes: Sequence[Axis], values: dict[str, float]
-) -> "Sequence[MeasuredPoint]":
-    """The forced runs with the settings of a diagram. Standard error lists the omitted runs."""
-    from capsule_id.commands.measured_runs import overlay
-
-    diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
-    if not diagram or not rig.has_runs:
-        return ()
-    by_name = args.spring if args.k2 is None else None
-    motions, sentence = overlay(rig, axes[0].name, axes[0].values(), values, fitted_values(args.result), by_name)
-    complain(sentence)
-    return motions
 
 
 def _axes(args: argparse.Namespace) -> tuple[Axis, ...]:
@@ -343,7 +327,7 @@ def _axis(prefix: str, name: str, begin: str, end: str, unit: str | None, points
         raise InputError(f"{name} must be positive", f"--{prefix}from {low:g}", "begin above 0")
     if SWEPT[name].sign == "not negative" and low < 0.0:
         raise InputError(f"{name} must not be negative", f"--{prefix}from {low:g}", "begin at 0 or above")
-    return Axis(name, low, high, n, unit if unit is not None else si, factor)
+    return Axis(name, np.linspace(low, high, n) * factor, si if unit is None else unit, factor)
 
 
 def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:

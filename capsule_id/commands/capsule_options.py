@@ -75,14 +75,13 @@ def capsule_values(
                 f"{name} ({leaf.meaning}) must be given", "it is missing", f"add --{name} X, in {leaf.unit}"
             )
         if not leaf.admits(value):
-            rule = f"must be {leaf.sign}" if leaf.sign == "positive" else "must not be negative"
-            remedy = {
-                "positive": "give a value above 0",
-                "not negative": "give 0 or more",
-                "any": "give a finite value",
-            }
+            rule, remedy = {
+                "positive": ("be positive", "give a value above 0"),
+                "not negative": ("not be negative", "give 0 or more"),
+                "any": ("be finite", "give a finite value"),
+            }[leaf.sign]
             place = f"--{name}" if text is not None else "the value"
-            raise InputError(f"{name} {rule}", f"{place} {value:g}", remedy[leaf.sign])
+            raise InputError(f"{name} must {rule}", f"{place} {value:g}", remedy)
         values[name] = value
     fit = args.result or getattr(args, "posterior", None)
     if args.spring is not None and (fit is None or values["G"] == math.inf):

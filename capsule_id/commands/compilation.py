@@ -3,7 +3,6 @@
 Those of XLA act before its first computation, those of BLAS before NumPy is imported.
 """
 
-import argparse
 import hashlib
 import os
 import platform
@@ -68,13 +67,6 @@ def prepare_jax(cached: bool, loop: bool = True) -> None:
             config.update(DIRECTORY.lower(), str(directory))
             for name, value in CACHE_SETTINGS.items():
                 config.update(name.lower(), type(value)(os.environ[name]))
-
-
-def add_cache_argument(options: argparse._ActionsContainer) -> None:
-    """Add ``--no-cache`` to a parser or a group."""
-    options.add_argument(
-        "--no-cache", action="store_true", help="compile everything anew, and keep no compiled program"
-    )
 
 
 def cache_directory() -> Path:

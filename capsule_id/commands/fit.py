@@ -6,8 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from capsule_id.commands import PATH
-from capsule_id.commands.compilation import add_cache_argument, prepare_jax
+from capsule_id.commands import NO_CACHE, PATH
+from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.rigs import Options, fit_many, fit_one
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError, check_seed
@@ -58,7 +58,7 @@ OPTIONS = {
             "roughly, by the point fits alone",
         ),
         ("--quiet", "", "no progress on standard error"),
-        add_cache_argument,
+        NO_CACHE,
     )
 }
 

@@ -2,8 +2,8 @@
 
 import argparse
 
-from capsule_id.commands import PATH
-from capsule_id.commands.compilation import add_cache_argument, prepare_jax
+from capsule_id.commands import NO_CACHE, PATH
+from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import say
 from capsule_id.errors import InputError, check_seed, refusing
 from capsule_id.output import replace_file
@@ -16,7 +16,7 @@ OPTIONS = {
         ("--out", "FILE", "table of the predictions, a new file", {**PATH, "required": True}),
         ("--figure", "PNG", "mean velocities against period too, a new file", PATH),
         ("--seed", None, "random seed of the draws (default 0)", {"type": int, "default": 0}),
-        add_cache_argument,
+        NO_CACHE,
     )
 }
 

@@ -57,8 +57,6 @@ def _shown(saved: dict[str, Any]) -> tuple[str, bool]:
 
 def _row(entry: dict[str, Any]) -> dict[str, Any]:
     """One row of the parameter table. The file has no standard error of the point fit."""
-    numbers = {key: entry[key] for key in ("value", "sd", "paper", "map", "mean", "median", "ess", "rhat")}
-    numbers["lower"], numbers["upper"] = entry["ci95"] or (None, None)
-    words = {key: entry[key] for key in ("unit", "basis", "trust", "informed")}
-    known = {key: math.nan if value is None else float(value) for key, value in numbers.items()}
-    return {**words, "quote": entry.get("quote", "sd"), "meaning": "", "standard_error": math.nan, **known}
+    lower, upper = entry["ci95"] or (None, None)
+    row = {"quote": "sd", "meaning": "", "standard_error": None, **entry, "lower": lower, "upper": upper}
+    return {key: math.nan if value is None else value for key, value in row.items()}

@@ -111,7 +111,6 @@ def fit_one(
     check_output(directory, options)
     prepare_jax(options.cached, rig.has_runs and options.experiments != "bench")
     # JAX loads only now, so that a faulty folder is reported at once.
-    from capsule_id.report.columns import table_text, wrapped
     from capsule_id.report.html import render
     from capsule_id.report.messages import messages_of
     from capsule_id.report.write import result_files, write_result
@@ -123,8 +122,7 @@ def fit_one(
 
         def show_point(first: "Fit") -> None:
             write_file(unfinished / "report.html", render(first, ()))
-            table = [table_text(first.summary, synthetic=rig.synthetic), *wrapped(first.remarks)]
-            progress.note("\n".join([f"point fit, before the sample; report: {unfinished / 'report.html'}", *table]))
+            progress.note(f"point fit, before the sample; report: {unfinished / 'report.html'}\n{first.table}")
 
         # A fit of bench tests ends as soon.
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
@@ -137,9 +135,7 @@ def fit_one(
     if as_json:
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
     else:
-        table = table_text(result.summary, synthetic=rig.synthetic)
-        changes = wrapped(result.remarks)
-        say("\n".join([table, *changes, f"report: {report}", result.verdict]))
+        say(f"{result.table}\nreport: {report}\n{result.verdict}")
     if not result.clean:
         complain(f"fit-params: verdict not clean: {', '.join(result.failed)}; see {report}")
     return CLEAN if result.clean else NOT_CLEAN

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from capsule_id.commands import PATH
+from capsule_id.commands import NO_CACHE, PATH
 from capsule_id.commands.capsule_options import capsule_and_drive, capsule_options, capsule_values, number
-from capsule_id.commands.compilation import add_cache_argument, prepare_jax
+from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import complain, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.output import replace_file
@@ -48,7 +48,7 @@ OPTIONS = {
     "output": (
         ("--out", "FILE", "table: FILE.csv or FILE.nc (NetCDF)", {**PATH, "required": True}),
         ("--figure", "FILE", "figure: FILE.png", PATH),
-        add_cache_argument,
+        NO_CACHE,
     ),
 }
 

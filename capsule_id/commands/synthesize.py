@@ -27,31 +27,21 @@ def run(args: argparse.Namespace) -> int:
         If DIR is not empty, or a value cannot be set.
     """
     check_seed(args.seed)
-    if args.robot:
-        return _robot(args)
     from capsule_id.experiments.kind import default_registry
-    from capsule_id.synthetic import Truth, synthesize
+    from capsule_id.synthetic import ROBOT, Truth, synthesize, synthesize_robot
 
-    truth = Truth().with_kinds(kind for kind in default_registry().values() if kind.bench or args.runs)
-    truth = truth.with_values(dict(_assignment(text) for text in args.set))
-    with refusing("DIR must be writable", "name another one", args.directory):
-        synthesize(args.directory, args.seed, truth, args.name, args.runs)
-    say(
-        f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and {args.directory.resolve().name}.truth.json beside it"
-    )
-    return 0
-
-
-def _robot(args: argparse.Namespace) -> int:
-    """Write the folder of a capsule robot; 0."""
-    from capsule_id.synthetic import ROBOT, synthesize_robot
-
-    values = dict(_assignment(text) for text in args.set)
-    if unknown := sorted(set(values) - set(ROBOT)):
+    values, beside = dict(_assignment(text) for text in args.set), ""
+    if args.robot and (unknown := sorted(set(values) - set(ROBOT))):
         raise InputError("--set takes a parameter of the robot", unknown[0], f"choose from {', '.join(ROBOT)}")
     with refusing("DIR must be writable", "name another one", args.directory):
-        synthesize_robot(args.directory, args.seed, None, values)
-    say(f"wrote {args.directory} (SYNTHETIC, seed {args.seed})")
+        if args.robot:
+            synthesize_robot(args.directory, args.seed, None, values)
+        else:
+            kinds = (kind for kind in default_registry().values() if kind.bench or args.runs)
+            truth = Truth().with_kinds(kinds).with_values(values)
+            synthesize(args.directory, args.seed, truth, args.name, args.runs)
+            beside = f" and {args.directory.resolve().name}.truth.json beside it"
+    say(f"wrote {args.directory} (SYNTHETIC, seed {args.seed}){beside}")
     return 0
 
 

@@ -35,6 +35,23 @@ class Prediction:
     panels: tuple[Comparison, ...]
 
 
+def random_draws(result: Result, number: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """``number`` draws of the sample, taken at random without repetition: name -> (number,), SI.
+
+    Raises
+    ------
+    InputError
+        If nothing was sampled, or there are fewer draws.
+    """
+    if result.posterior is None:
+        raise InputError("draws need a sample", "the point fit alone", "fit without --no-sample (budget=None)")
+    flat = result.posterior.draws.reshape(-1, len(result.posterior.names))
+    if not 1 <= number <= len(flat):
+        raise InputError("draws must lie between 1 and the sample's", str(number), f"give at most {len(flat)}")
+    chosen = flat[rng.choice(len(flat), number, replace=False)]
+    return dict(zip(result.posterior.names, chosen.T, strict=True))
+
+
 def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Prediction:
     """Predict a new trial in a new session at each row of a table of settings.
 
@@ -59,19 +76,13 @@ def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int 
     experiment = next((e for e in made if isinstance(e, Progression) and e.label in result.observed), None)
     if experiment is None:
         raise InputError("a prediction needs a fit with a progression", "none", "add one to the rig and fit again")
-    if result.posterior is None:
-        raise InputError("a prediction needs a sample", "the point fit alone", "fit without --no-sample (budget=None)")
-    flat = result.posterior.draws.reshape(-1, len(result.posterior.names))
-    if not 1 <= draws <= len(flat):
-        raise InputError("draws must lie between 1 and the sample's", str(draws), f"give at most {len(flat)}")
+    rng = np.random.default_rng(seed)
+    chosen = random_draws(result, draws, rng)
     columns = read_settings(Path(settings), result.registry[experiment.kind], READING)
     _check_settings(experiment.table, columns, Path(settings))
-    rng = np.random.default_rng(seed)
-    chosen = flat[rng.choice(len(flat), draws, replace=False)]
     constants = {**result.fixed, "g": result.rig.g.value}
-    values = [
-        experiment.local({**constants, **dict(zip(result.posterior.names, theta, strict=True))}) for theta in chosen
-    ]
+    thetas = zip(*chosen.values(), strict=True)
+    values = [experiment.local({**constants, **dict(zip(chosen, theta, strict=True))}) for theta in thetas]
     rows, time = experiment.settings_of(columns)
     trials = 1e3 * experiment.new_trials(values, rows, rng)
     lower, median, upper = np.quantile(trials, [0.025, 0.5, 0.975], axis=0)

@@ -336,12 +336,11 @@ def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: 
     while large.any():
         worst = int(np.argmax(np.where(large, deviation, 0.0)))
         # The record may be noisier here than elsewhere.
-        if deviation[worst] * noise <= JUMP_SDS * _local_noise(values[worst : worst + 2 * side]):
-            noisy = noisy or Jump(worst + side, float(phase[worst]), noisy=True)
-            large[max(0, worst - side) : worst + side] = False
-            continue
-        if not alone or not _recurs(jumps, precision, worst, period):
-            return Jump(worst + side, float(phase[worst]))
+        hidden = deviation[worst] * noise <= JUMP_SDS * _local_noise(values[worst : worst + 2 * side])
+        found = Jump(worst + side, float(phase[worst]), bool(hidden))
+        if not hidden and not (alone and _recurs(jumps, precision, worst, period)):
+            return found
+        noisy = noisy or (found if hidden else None)
         large[max(0, worst - side) : worst + side] = False
     return noisy
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
+from scipy.special import logsumexp
 
 from capsule_id.records.tones import noise_level
 from capsule_id.rig.filters import Record
@@ -27,8 +28,8 @@ class Local:
 
 
 def local_polynomials(
-    phase: Float[np.ndarray, " n"],
-    values: Float[np.ndarray, " n"],
+    phase: Record,
+    values: Record,
     period: float,
     places: Float[np.ndarray, " m"],
     half_width: float,
@@ -64,7 +65,7 @@ def local_polynomials(
     return Local(unknowns[:, 0], rate, np.sqrt(inverse[:, 0, 0]), rate_sd)
 
 
-def intervals_above(z: Float[np.ndarray, " n"], low: float, high: float) -> list[tuple[int, int]]:
+def intervals_above(z: Record, low: float, high: float) -> list[tuple[int, int]]:
     """Stretches of a cyclic sequence (n,) that begin above ``high`` and last until it has fallen below ``low``.
 
     Returns (first, length) of each, indices modulo n; a sequence that never falls below ``low`` is one stretch if it
@@ -277,7 +278,7 @@ class _Evidence:
         rest = float(np.sum(self._residuals(n) ** 2)) / (len(self._cycles) - self._drift_terms - n + 1)
         return float(np.sqrt(max(rest - self._noise, 0.0)))
 
-    def probabilities(self) -> Float[np.ndarray, " n"]:
+    def probabilities(self) -> Record:
         """(17,) posterior probabilities of an aperiodic motion and of the periods 1 to 16."""
         n = np.arange(1, LONGEST_PERIOD + 1)
         prior = (1.0 - APERIODIC_PRIOR) * n**PERIOD_EXPONENT / np.sum(n**PERIOD_EXPONENT)
@@ -285,13 +286,13 @@ class _Evidence:
         periodic = np.array([self._log_evidence(one, *_periodic_scatter(k)) for k, one in enumerate(levels, start=1)])
         bands, wide = levels[:MOST_BANDS], np.geomspace(*APERIODIC_SCATTER, _GRID)
         scattered = np.array([self._log_evidence(one, wide) for one in bands])
-        aperiodic = _log_sum(scattered) + np.log(APERIODIC_PRIOR / len(bands))
+        aperiodic = logsumexp(scattered) + np.log(APERIODIC_PRIOR / len(bands))
         parts = [aperiodic, *(periodic + np.log(prior[: self._longest]))]
         if self._longest < LONGEST_PERIOD:  # a longer period looks like scatter of any size
             parts.append(
                 self._log_evidence(levels[0], np.geomspace(*PART, _GRID)) + np.log(np.sum(prior[self._longest :]))
             )
-        posterior = np.exp(np.array(parts) - _log_sum(np.array(parts)))
+        posterior = np.exp(np.array(parts) - np.asarray(logsumexp(parts)))
         return np.pad(posterior[: self._longest + 1], (0, LONGEST_PERIOD - self._longest))
 
     def _log_evidence(
@@ -306,17 +307,14 @@ class _Evidence:
         power = np.sum([level.power for level in levels], axis=0)[:, None]
         dimensions = sum(level.dimensions for level in levels)
         value = -0.5 * self._independent * (dimensions * np.log(variance) + power / variance)
-        for level in levels[1:]:
-            ratio = self._log_ratio(level, variance)
-            value = value + (ratio if level is levels[-1] else np.logaddexp(0.0, ratio) - np.log(2.0))
-        return float(_log_sum((value + np.log(weight)).ravel()) - np.log(len(r)))
-
-    def _log_ratio(self, level: _Level, variance: Float[np.ndarray, "r q"]) -> Float[np.ndarray, "r q"]:
-        """Log of the likelihood of a level over that of scatter alone, for each variance of the scatter."""
         part = np.geomspace(*PART, _GRID)[:, None, None]
-        more = variance + level.gain[:, None] * len(self._cycles) * part**2 / level.dimensions
-        terms = level.dimensions * np.log(more / variance) + level.power[:, None] * (1.0 / more - 1.0 / variance)
-        return _log_sum(-0.5 * self._independent * terms) - np.log(_GRID)
+        for level in levels[1:]:
+            # The likelihood of the level over that of scatter alone, for each variance of the scatter.
+            more = variance + level.gain[:, None] * len(self._cycles) * part**2 / level.dimensions
+            terms = level.dimensions * np.log(more / variance) + level.power[:, None] * (1.0 / more - 1.0 / variance)
+            ratio = logsumexp(-0.5 * self._independent * terms, axis=0) - np.log(_GRID)
+            value = value + (ratio if level is levels[-1] else np.logaddexp(0.0, ratio) - np.log(2.0))
+        return float(logsumexp(value + np.log(weight)) - np.log(len(r)))
 
     def _levels(self, n: int) -> list[_Level]:
         """What the drift and period n leave of the filtered cycles, then the levels of the divisors of n, n last."""
@@ -361,9 +359,3 @@ def _periodic_scatter(n: int) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray
     q = np.geomspace(PERIODIC_SCATTER[0], PERIODIC_SCATTER[1] / n, _GRID)
     weight = np.minimum(1.0, (COMMON_SCATTER / q) ** SCATTER_EXPONENT)
     return q, weight / np.sum(weight)
-
-
-def _log_sum(logs: Float[np.ndarray, "n ..."]) -> Any:
-    """Log of the sum of exponentials over the first axis; SciPy's takes ten times as long on small arrays."""
-    largest = np.max(logs, axis=0)
-    return largest + np.log(np.sum(np.exp(logs - largest), axis=0))

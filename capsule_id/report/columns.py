@@ -349,12 +349,10 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = No
     aligned = [f"{'>' if i > 1 else '<'}{longest}" for i, longest in enumerate(widths[:shown])]
     lines = [_GAP.join(map(format, cells[:shown], aligned)).rstrip() for cells in table]
     rule = "-" * max(map(len, lines))
-    left_out = ", ".join(table[0][shown:])
-    more = wrapped([f"in a wider terminal and in report.html: {left_out}"] if left_out else [], width)
-    if skewed := skewed_names(summary):
-        names = f"{', '.join(skewed)}: skewed; quote the value with its 95 % interval"
-        more = [*wrapped([names], width), *more]
-    return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:], *more])
+    skewed, left_out = skewed_names(summary), table[0][shown:]
+    notes = [f"{', '.join(skewed)}: skewed; quote the value with its 95 % interval"] if skewed else []
+    notes += [f"in a wider terminal and in report.html: {', '.join(left_out)}"] if left_out else []
+    return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:], *wrapped(notes, width)])
 
 
 def wrapped(texts: Sequence[str], width: int | None = None) -> list[str]:

@@ -24,7 +24,6 @@ from capsule_id.parameters import Name, is_stated, symbol_of
 from capsule_id.records.motion import UNDECIDED
 from capsule_id.report.columns import (
     MISSING,
-    Row,
     SampledParameters,
     errors_left_out,
     fixed,
@@ -38,7 +37,7 @@ from capsule_id.report.columns import (
 from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import figure_of, mark, new_axes, new_figure, png
 from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, title_of
-from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, after_number, counted
+from capsule_id.views import Comparison, Level, Message, ResultTable, after_number, counted
 
 # gallery: All pictures of a result, drawn once: the page embeds the same bytes as in ``figures/``.
 
@@ -215,12 +214,9 @@ def _unique(labels: Iterable[str]) -> list[str]:
 # html: The page: one self-contained HTML file, figures embedded, one small script, nothing loaded from elsewhere.
 
 
-_TEMPLATES = Path(__file__).with_name("templates")
-_WHOLE_FIT: tuple[Section, ...] = ("sample", "point_fit")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
 #: Largest number of figures of experiments that are open at first; those of the sample and the point fit add 3.
 MOST_OPEN = 9
-_WORDS: Mapping[Level, str] = {"ok": "✓ ok", "warn": "! warning", "fail": "✗ failed"}
 
 
 def render(result: Result, pictures: Sequence[Picture]) -> str:
@@ -231,46 +227,31 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
     # Narrow pictures go in pairs, and a wide one between them leaves a gap.
     narrow_first = sorted(pictures, key=lambda picture: picture.wide)
     titles = {finding.code: title_of(finding.code, messages) for finding in result.findings}
-    return (
-        _environment()
-        .get_template("report.html.j2")
-        .render(
-            result=result,
-            answers=[(row, _truth(row, result.truth.get(row.name))) for row in stated_last],
-            steps=next_steps(result),
-            skewed=skewed_names(result.summary),
-            left_out=errors_left_out(result.summary),
-            experiments=_experiments(result, [picture for picture in pictures if picture.section == "measured"]),
-            sections={name: [picture for picture in narrow_first if picture.section == name] for name in _WHOLE_FIT},
-            parameters=printed_table(result.summary, "html"),
-            nuisances=printed_table(result.nuisances, "html"),
-            checks=_checks(result.findings, titles),
-            findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
-            words=_WORDS,
-            verdict=verdict_text(result.trust, [(found.level, titles[found.code]) for found in result.findings]),
-            starts=_starts(result),
-            notes=[_note(note, messages) for note in result.notes],
-            terms={term: TERMS[term] for term in TERMS if result.posterior or term not in OF_A_SAMPLE},
-            missing=MISSING,
-            names=NAMES,
-            title=TITLE,
-            published=PUBLISHED,
-            copies=(
-                ("methods", "Methods paragraph", methods_paragraph(result)),
-                ("bibtex", "BibTeX", bibtex(result)),
-                ("latex", "LaTeX table", latex_table(result)),
-            ),
-        )
+    tables = select_tables(result.rig, result.provenance.experiments)
+    return _ENVIRONMENT.get_template("report.html.j2").render(
+        result=result,
+        answers=stated_last,
+        steps=next_steps(result),
+        skewed=skewed_names(result.summary),
+        left_out=errors_left_out(result.summary),
+        experiments=_experiments(result, [picture for picture in pictures if picture.section == "measured"]),
+        pictures=narrow_first,
+        parameters=printed_table(result.summary, "html"),
+        nuisances=printed_table(result.nuisances, "html"),
+        checks=dict.fromkeys(titles.values()),
+        findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
+        verdict=verdict_text(result.trust, [(found.level, titles[found.code]) for found in result.findings]),
+        best=np.nanmax(result.point_fit.log_posterior),
+        notes=[_note(note, messages) for note in result.notes],
+        terms={term: TERMS[term] for term in TERMS if result.posterior or term not in OF_A_SAMPLE},
+        missing=MISSING,
+        names=NAMES,
+        title=TITLE,
+        published=PUBLISHED,
+        paper=PAPER,
+        fitted=Counter(table.kind.replace("_", " ") for table in tables),
+        latex=latex_table(result),
     )
-
-
-def _truth(row: Row, truth: float | None) -> str:
-    """The true value of a synthetic rig, and how far the estimate is from it."""
-    known = MISSING if truth is None else fixed(truth * row.scale, row.decimals)
-    sd = float(row.values["sd"])
-    if truth is not None and sd > 0.0:
-        known += f" ({(float(row.values['value']) - truth) / sd:+.1f} sd)".replace("-", "−")
-    return known
 
 
 def _experiments(result: Result, measured: Sequence[Picture]) -> list[dict[str, object]]:
@@ -297,45 +278,8 @@ def _experiments(result: Result, measured: Sequence[Picture]) -> list[dict[str, 
 def summary_html(result: Result, verdict: str, changes: Sequence[str]) -> str:
     """Verdict, changes of the model (texts of the findings that make them) and parameter table, for a notebook."""
     columns, rows = printed_table(result.summary, "console")
-    template = _environment().get_template("summary.html.j2")
+    template = _ENVIRONMENT.get_template("summary.html.j2")
     return template.render(result=result, changes=changes, verdict=verdict, columns=columns, rows=rows, missing=MISSING)
-
-
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "symbol_parts": symbol_parts,
-        "number": _number,
-        "embed": lambda picture: "data:image/png;base64," + base64.b64encode(picture.png).decode("ascii"),
-        "after_number": after_number,
-    }
-    return environment
-
-
-def _checks(findings: Sequence[Finding], titles: Mapping[str, str]) -> list[tuple[str, Level, int]]:
-    """A cell per check: its title, its worst level, and how many findings have that level."""
-    cells = []
-    for check in dict.fromkeys(titles[finding.code] for finding in findings):
-        levels = [finding.level for finding in findings if titles[finding.code] == check]
-        worst = min(levels, key=_WORST_FIRST.index)
-        cells.append((check, worst, levels.count(worst)))
-    return cells
-
-
-def _starts(result: Result) -> list[tuple[int, str, str, bool]]:
-    """Number, log-posterior at the end, how far that is below the best, and whether the solver stalled."""
-    fit = result.point_fit
-    best = max((float(value) for value in fit.log_posterior if not math.isnan(value)), default=math.nan)
-    return [
-        (i, _number(float(value), ".8g"), _number(best - float(value), ".2g"), bool(stalled))
-        for i, (value, stalled) in enumerate(zip(fit.log_posterior, fit.stalled, strict=True), start=1)
-    ]
 
 
 def _note(note: ResultTable, messages: Mapping[str, Message]) -> dict[str, object]:
@@ -359,6 +303,22 @@ def _number(value: object, form: str = ".5g") -> str:
     if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
         return MISSING if math.isnan(value) else format(float(value), form).replace("-", "−")
     return str(value)
+
+
+_ENVIRONMENT = Environment(
+    loader=FileSystemLoader(Path(__file__).with_name("templates")),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_ENVIRONMENT.filters |= {
+    "symbol_parts": symbol_parts,
+    "fixed": fixed,
+    "number": _number,
+    "embed": lambda picture: "data:image/png;base64," + base64.b64encode(picture.png).decode("ascii"),
+    "after_number": after_number,
+}
 
 
 # advice: What would improve a result: the steps that the first screen of the report lists.
@@ -455,56 +415,24 @@ def _factor(remaining: float) -> str:
     return f"{max(remaining, 1e-4) ** -0.5:.2g}"
 
 
-# citation: What a paper or a thesis takes over from a result: methods paragraph, BibTeX entries, LaTeX table.
+# citation: What a paper or a thesis takes over from a result: the paper's reference and a LaTeX table. The template has
+# the methods paragraph.
 
 
 #: The paper whose model and rig this package fits.
-AUTHORS = ("Yang Liu", "Ekaterina Pavlovskaia", "Marian Wiercigroch")
+NAMES = "Yang Liu, Ekaterina Pavlovskaia and Marian Wiercigroch"
 TITLE = "Experimental verification of the vibro-impact capsule model"
 JOURNAL, VOLUME, YEAR, PAGES = "Nonlinear Dynamics", 83, 2016, (1029, 1041)
 PUBLISHED = f"{JOURNAL} {VOLUME} ({YEAR}) {PAGES[0]}–{PAGES[1]}"
-NAMES = f"{', '.join(AUTHORS[:-1])} and {AUTHORS[-1]}"
+PAPER = {
+    "author": "Liu, Yang and Pavlovskaia, Ekaterina and Wiercigroch, Marian",
+    "title": TITLE,
+    "journal": JOURNAL,
+    "volume": VOLUME,
+    "year": YEAR,
+    "pages": f"{PAGES[0]}--{PAGES[1]}",
+}
 _ESCAPES = str.maketrans({"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"})
-
-
-def methods_paragraph(result: Result) -> str:
-    """The method in sentences, with the numbers of this fit."""
-    version = result.provenance.versions.get("capsule-id", "")
-    tables = select_tables(result.rig, result.provenance.experiments)
-    kinds = Counter(table.kind.replace("_", " ") for table in tables)
-    tests = ", ".join(f"{number} x {kind}" for kind, number in kinds.items()) or "the experiments listed in this report"
-    data = "Synthetic data were used. " if result.rig.synthetic else ""
-    sentences = [
-        f"{data}The parameters of the vibro-impact capsule model of {NAMES} ({TITLE}, {PUBLISHED}) were "
-        f"identified with capsule-id {version} from {tests}.",
-        "All experiments share one set of parameters, with proper priors, and one likelihood of the raw readings.",
-    ]
-    if result.posterior is None:
-        sentences.append("Values are the maximum of the posterior with its standard error; nothing was sampled.")
-    else:
-        ensembles, draws, walkers, _ = result.posterior.draws.shape
-        sentences.append(
-            f"The posterior was sampled by {ensembles} independent ensembles of {walkers} walkers (emcee; {draws} stored draws "
-            f"each, largest split R-hat {max(result.posterior.rhat):.3f}). Values are posterior medians and sds"
-            + ("; of skewed posteriors, medians and central 95 % intervals." if skewed_names(result.summary) else ".")
-        )
-    verdict = (
-        "No check of the data failed." if result.clean else "At least one check of the data failed; see the findings."
-    )
-    return " ".join([*sentences, verdict])
-
-
-def bibtex(result: Result) -> str:
-    """Entries of the paper and of this software."""
-    version = result.provenance.versions.get("capsule-id", "")
-    authors = " and ".join(f"{name.rpartition(' ')[2]}, {name.rpartition(' ')[0]}" for name in AUTHORS)
-    return (
-        f"@article{{liu_capsule,\n  author = {{{authors}}},\n  title = {{{TITLE}}},\n  journal = {{{JOURNAL}}},\n"
-        f"  volume = {{{VOLUME}}},\n  year = {{{YEAR}}},\n  pages = {{{PAGES[0]}--{PAGES[1]}}}\n}}\n\n"
-        "@software{capsule_id,\n  author = {{The capsule-id developers}},\n"
-        "  title = {capsule-id: system identification for the vibro-impact capsule},\n"
-        f"  version = {{{version}}}\n}}"
-    )
 
 
 def latex_table(result: Result) -> str:

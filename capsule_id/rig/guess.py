@@ -6,7 +6,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import groupby, islice, pairwise, product
+from itertools import chain, groupby, islice, pairwise, product
 from pathlib import Path
 from typing import Literal
 
@@ -16,9 +16,9 @@ from scipy.optimize import linear_sum_assignment
 from capsule_id.errors import InputError, printable
 from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
-from capsule_id.rig.formats.layouts import delimiter_of, is_number
+from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
 from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile
-from capsule_id.rig.formats.text import bare, is_row, texts_of
+from capsule_id.rig.formats.text import is_row
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
 
@@ -292,36 +292,23 @@ def _runs(lines: Iterable[str], layout: Layout) -> tuple[list[tuple[Cells, list[
 def _cells_of_row(line: str, layout: Layout) -> Cells:
     """Separator and number of cells of a line that begins with a number, or a missing one before others; else None."""
     delimiter = delimiter_of(line, layout)
-    texts = [bare(cell) for cell in texts_of(line, delimiter)]
+    texts = split_bare(line, delimiter)
     begins = is_number(texts[0]) or (texts[0] in layout.missing and any(map(is_number, texts)))
     return (delimiter, len(texts)) if begins else None
 
 
 def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
     """The layout with the markers alone that occur in the ``used`` columns."""
-    read = EXPORTS[suffix_of(found.export.path)]
-
-    def reads(markers: tuple[str, ...]) -> bool:
-        try:
-            export = read(content, found.export.path, replace(found.layout, missing=markers))
-            for column in used:
-                export.values(column)
-        except InputError:
-            return False
-        return True
-
-    suffix = suffix_of(found.export.path).removesuffix(COMPRESSED)
-    text = TextFile(content, found.export.path) if suffix in TEXTS else None
-    known = ("NaN",) if text is None and suffix != ".xlsx" else MARKERS
-    missing = tuple(marker for marker in known if text is None or text.has_cell(marker))
-    gaps = any(np.isnan(found.columns[column]).any() for column in used)
-    if not gaps and reads(()):
+    path, numbers = found.export.path, tuple(index + 1 for index in used)
+    missing: tuple[str, ...] = ("NaN",)
+    if not any(np.isnan(found.columns[index]).any() for index in used):
         missing = ()
-    if gaps and len(missing) == 1:  # a long file takes seconds to read
-        return replace(found.layout, missing=missing)
-    for marker in missing:
-        fewer = tuple(each for each in missing if each != marker)
-        missing = fewer if reads(fewer) else missing
+    elif suffix_of(path).removesuffix(COMPRESSED) in TEXTS or suffix_of(path) == ".xlsx":
+        export = EXPORTS[suffix_of(path)](content, path, replace(found.layout, columns=numbers, words=numbers))
+        columns = [export.words(index).tolist() for index in used] if export.words else []
+        everything = (re.split("[\t,]", line) for line in TextFile(content, path).lines())  # of a LabVIEW file
+        cells = set(chain.from_iterable(columns or everything))
+        missing = tuple(marker for marker in MARKERS if marker in cells)
     return replace(found.layout, missing=missing)
 
 

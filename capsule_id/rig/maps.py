@@ -112,10 +112,9 @@ class Range:
 
     min: float
     max: float
-    is_range: bool = True
 
     def __str__(self) -> str:
-        if not self.is_range:
+        if self.min == self.max:
             return f"{self.min:.15g}"
         if self.max == inf:
             return f"{self.min:.15g} or more"
@@ -227,7 +226,7 @@ def _wanted(node: Node) -> Wanted:
         return value.strip()
     if not isinstance(value, dict):
         number = float(NUMBER.read(node))
-        return Range(number, number, is_range=False)
+        return Range(number, number)
     node.refuse_unknown(("min", "max"))
     if not value:
         raise node.error("a range must have min or max", "none", "write { min = 2, max = 10 }, or one of them")
@@ -284,20 +283,17 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
         if (rate := source.rate) is not None:
             values[name] = np.arange(first_rows[-1]) / rate
     names = tuple(column_map.sources)
-    origin = None if keep is None else np.flatnonzero(keep)
-    columns = tuple(values[name] if keep is None else values.pop(name)[keep] for name in names)
 
     def place(row: int | None, column: int) -> Place:
-        index = 0 if row is None else row if origin is None else int(origin[row])
-        part = 0 if row is None else int(np.searchsorted(first_rows, index, side="right")) - 1
+        part = 0 if row is None else int(np.searchsorted(first_rows, row, side="right")) - 1
         here = places[part].get(names[column]) or next(iter(places[part].values()))
-        return here(None if row is None else index - int(first_rows[part]))
+        return here(None if row is None else row - int(first_rows[part]))
 
     # Arrays of a file may have other lengths than those that the map names.
-    lines = first.lines[: int(first_rows[-1])]
-    rows = np.arange(1, 1 + len(columns[0])) if len(parts) > 1 else lines if keep is None else lines[keep]
+    rows = np.arange(1, 1 + int(first_rows[-1])) if len(parts) > 1 else first.lines[: int(first_rows[-1])]
     units = tuple(column_map.sources[name].unit for name in names)
-    return RawTable(names, units, columns, rows, place, missing=missing, other=other)
+    raw = RawTable(names, units, tuple(values[name] for name in names), rows, place, missing=missing, other=other)
+    return raw if keep.all() else raw.taken(np.flatnonzero(keep))
 
 
 class _Part:
@@ -311,54 +307,39 @@ class _Part:
         """Number of rows of the columns found."""
         return next(iter(self._rows), 0)
 
-    def find(self, node: Node, header: Header) -> Found:
-        """The column ``header``, stated at ``node`` of ``rig.toml``."""
-        (first, column), *others = self._columns(node, header)
-        values = first.values(column)
-        self._require_rows(node, header, values.size)
-        for export, index in others:
-            same = export.values(index)
-            self._require_rows(node, header, same.size)
-            scale = float(np.nanmax(np.abs(values), initial=0.0))
-            if not np.allclose(same, values, rtol=0.0, atol=ROUNDING * scale, equal_nan=True):
-                raise node.error(
-                    f"{shown(header)} must be the same in {first.path.name} and {export.path.name}",
-                    f"a difference of {np.nanmax(np.abs(same - values)):.3g}",
-                    "name files that were recorded together",
-                )
-        place = first.place  # the numbers of the file are not kept beside the table
-        return values, lambda row: place(row, column)
-
-    def words(self, node: Node, header: Header) -> np.ndarray:
-        """The texts of the column ``header``, stated at ``node`` of ``rig.toml``, (n,)."""
-        found: list[np.ndarray] = []
-        for export, column in self._columns(node, header):
-            if export.words is None:
+    def find(self, node: Node, header: Header, texts: bool = False) -> Found:
+        """The column ``header``, stated at ``node`` of ``rig.toml``: its numbers, or its ``texts``."""
+        named, found = self._columns(node, header), list[np.ndarray]()
+        for export, index in named:
+            read = export.words if texts else export.values
+            if read is None:
                 raise node.error(
                     f"where takes numbers for a {export.path.suffix} file",
                     "a text",
                     "write a number, or export the file as CSV",
                 )
-            found.append(export.words(column))
-            self._require_rows(node, header, len(found[-1]))
-            if differ := np.flatnonzero(found[-1] != found[0]).tolist():
-                rule, row = f"{shown(header)} must be the same in all files that have it", differ[0]
+            found.append(read(index))
+            self._rows.append(found[-1].size)
+            if found[-1].size != self.rows:
                 raise node.error(
-                    rule,
-                    f"{shown(str(found[0][row]))} and {shown(str(found[-1][row]))}",
+                    f"columns must have equal lengths ({self.rows})",
+                    f"{shown(header)}: {found[-1].size}",
+                    "map columns of equal length, or make an experiment of each file, with a clock",
+                )
+            same = found[-1] == found[0]
+            if not (texts or same.all()):
+                rounding = ROUNDING * float(np.nanmax(np.abs(found[0]), initial=0.0))
+                same = np.isclose(found[-1], found[0], rtol=0.0, atol=rounding, equal_nan=True)
+            if not same.all():
+                one, other = (each[~same].tolist()[0] for each in (found[0], found[-1]))
+                raise node.error(
+                    f"{shown(header)} must be the same in {named[0][0].path.name} and {export.path.name}",
+                    f"{shown(one)} and {shown(other)}",
                     "name files that were recorded together",
                 )
-        return found[0]
-
-    def _require_rows(self, node: Node, header: Header, rows: int) -> None:
-        """Refuse a column with another number of rows than those found before."""
-        self._rows.append(rows)
-        if rows != self.rows:
-            raise node.error(
-                f"columns must have equal lengths ({self.rows})",
-                f"{shown(header)}: {rows}",
-                "map columns of equal length, or make an experiment of each file, with a clock",
-            )
+        (first, column), values = named[0], found[0]
+        place = first.place  # the numbers of the file are not kept beside the table
+        return values, lambda row: place(row, column)
 
     def _columns(self, node: Node, header: Header) -> list[tuple[Export, int]]:
         """The files that have the column ``header``, each with its index there; at least one."""
@@ -406,8 +387,7 @@ def _selected_by(parts: Sequence[_Part], node: Node, wanted: Wanted) -> tuple[np
     stated = any(key in row for part in parts for export in part.exports for row in export.headers)
     number = key.isascii() and key.isdigit() and int(key) > 0 and not stated
     header: Header = int(key) if number else " ".join(key.split())
-    found = [part.words(node, header) if is_text else part.find(node, header)[0] for part in parts]
-    column = np.concatenate(found)
+    column = np.concatenate([part.find(node, header, is_text)[0] for part in parts])
     if isinstance(wanted, str):
         rows, unknown = column == wanted, column == ""
     else:
@@ -420,7 +400,7 @@ def _selected_by(parts: Sequence[_Part], node: Node, wanted: Wanted) -> tuple[np
             f"where must keep a row; column {shown(key)} holds {_held(column, wanted)}",
             shown(wanted) if is_text else str(wanted),
             "widen the range"
-            if isinstance(wanted, Range) and wanted.is_range
+            if isinstance(wanted, Range) and wanted.min < wanted.max
             else "write one of the values of the column",
         )
     return rows, unknown
@@ -429,7 +409,7 @@ def _selected_by(parts: Sequence[_Part], node: Node, wanted: Wanted) -> tuple[np
 def _held(column: np.ndarray, wanted: Wanted) -> str:
     """What a column, (n,) texts or numbers, holds where nothing is ``wanted``, in words."""
     seen = np.unique(column if isinstance(wanted, str) else column[~np.isnan(column)])
-    if isinstance(wanted, Range) and wanted.is_range and seen.size:
+    if isinstance(wanted, Range) and wanted.min < wanted.max and seen.size:
         return f"{seen[0]:.15g} to {seen[-1]:.15g}"
     texts = [shown(str(one)) if isinstance(wanted, str) else f"{one:.15g}" for one in seen[: _MOST_VALUES + 1]]
     return " ".join(texts[:_MOST_VALUES]) + " …" * (len(texts) > _MOST_VALUES) or "no number"
@@ -447,8 +427,8 @@ def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.n
 
 def _kept(
     node: Node, values: Mapping[str, np.ndarray], where: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray | None, int, int]:
-    """Which rows are used (None: all), and how many are dropped: for a missing cell, and outside ``where``."""
+) -> tuple[np.ndarray, int, int]:
+    """Which rows are used, and how many are dropped: for a missing cell, and outside ``where``."""
     everything = np.ones(next(iter(values.values())).size, bool)
     inside = np.all([everything, *(rows for rows, _ in where)], axis=0)
     unknown = np.any([~everything, *(rows for _, rows in where)], axis=0)
@@ -457,4 +437,4 @@ def _kept(
     if not keep.any():
         raise node.error("a table must have rows", "none is left", "correct where, or map another column")
     missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
-    return None if keep.all() else keep, missing, keep.size - int(np.sum(keep)) - missing
+    return keep, missing, keep.size - int(np.sum(keep)) - missing

@@ -81,12 +81,7 @@ def without_outliers(node: Node, raw: RawTable, times: Callable[[RawTable], np.n
     judged = [column for name, column in zip(raw.names, raw.columns, strict=True) if name != "time"]
     outlying = [hampel_outliers(values, 2 * round(half) + 1, float(stated["n_sd"])) for values in judged]
     kept = np.flatnonzero(~np.any([np.zeros(len(time), bool), *outlying], axis=0))
-
-    def place(row: int | None, column: int) -> Place:
-        return raw.place(None if row is None else int(kept[row]), column)
-
-    columns = tuple(column[kept] for column in raw.columns)
-    return replace(raw, columns=columns, rows=raw.rows[kept], place=place, rejected=len(time) - len(kept))
+    return replace(raw.taken(kept), rejected=len(time) - len(kept))
 
 
 # plateaus: Makes readings of a time trace of steps: ``plateaus = { levels = [0, 10, 20], unit = "lbf", guard = "2 s"

@@ -20,7 +20,7 @@ from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.filters import FEWEST_PERIODS, clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
-from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError
+from capsule_id.rig.formats.text import MissingCellsError
 from capsule_id.rig.guess import find_layout, proposal
 from capsule_id.rig.maps import MAP_KEYS, apply_map, on_reference, read_map
 from capsule_id.rig.model import NO_DRIFT, Column, Instrument, Quantity, Rig, Settings, Table
@@ -541,33 +541,16 @@ def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTa
         raw = READERS[suffix](content, file)
         _check_names(raw.names, kind, partial(raw.error, None))
     except InputError as error:
-        own = _own_map(TextFile(content, file).line(0), kind)
-        if isinstance(error, MissingCellsError) and own:
-            missing = json.dumps(error.texts, ensure_ascii=False)
-            remedy = (
-                f"add two lines to the experiment, which drop all rows without a reading: {own} and missing = {missing}"
-            )
-        elif error.line != 1 or _A_TRIAL in error.remedy:
+        lost = isinstance(error, MissingCellsError)
+        if not lost and (error.line != 1 or _A_TRIAL in error.remedy):
             raise
-        elif own:
-            remedy = f"add to the experiment {own}: other columns are then not read"
-        else:
-            remedy = f"{error.remedy}; or add {_proposal(file, kind, Layout())} to the experiment"
+        proposed = _proposal(file, kind, Layout())
+        remedy = f"{error.remedy}; or add {proposed} to the experiment, and no other column is read"
+        if lost:
+            proposed += f" and missing = {json.dumps(error.texts, ensure_ascii=False)}"
+            remedy = f"add two lines to the experiment, which drop all rows without a reading: {proposed}"
         raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
     return raw
-
-
-def _own_map(header: str, kind: KindRule) -> str:
-    """The column map of the headers of a table that the kind itself has; "" where they are not those that it needs."""
-    own = [(found[1], found[0], found[2]) for found in HEADER_CELL.finditer(header)]
-    own = [(name, *rest) for name, *rest in own if name in kind.columns]
-    names = [name for name, *_ in own]
-    try:
-        _check_names(names, kind, lambda name, *text: InputError(*text))
-    except (InputError, IndexError):
-        return ""
-    texts = [f"{name} = {{ from = {json.dumps(header)}, unit = {json.dumps(unit)} }}" for name, header, unit in own]
-    return f"columns = {{ {', '.join(texts)} }}" if len({*names}) == len(names) else ""
 
 
 def _proposal(file: Path, kind: KindRule, layout: Layout) -> str:

@@ -146,7 +146,7 @@ def test_parameters_of_a_fitted_rig(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_measured_runs_are_laid_over_the_diagram() -> None:
     assert _run(*OVER, *SHORT) == 0
-    axes = (command.Axis("k2", 5.0, 50.0, 4, "kN/m", 1e3),)
+    axes = (command.Axis("k2", np.linspace(5e3, 5e4, 4), "kN/m", 1e3),)
     figure = command.draw(_opened("bifurcation-k2.nc"), axes, [MeasuredPoint(2e4, "P-1-F-2", 4e-4)])
     lower = figure.axes[1]
     (run,) = [line for line in lower.lines if line.get_label() == "measured"]

@@ -12,7 +12,7 @@ from capsule_id.api import Fit
 from capsule_id.inference.result import Result
 from capsule_id.inference.tables import _limited, quote
 from capsule_id.report.columns import table_rows, table_text
-from capsule_id.report.html import latex_table, methods_paragraph, render
+from capsule_id.report.html import latex_table, render
 from capsule_id.report.write import parameters_json
 from tests.report.conftest import make_result
 
@@ -75,7 +75,7 @@ def test_every_output_prints_the_interval(skewed: Result) -> None:
     assert '<td class="n quote">400 (3.2 to 1900) m/s</td>' in page
     assert "of skewed ones (v_s) the 95 % interval" in page
     assert r"$v_s$ & m/s & $400$ ($3.2$ to $1900$) & trusted \\" in latex_table(skewed)
-    assert "of skewed posteriors, medians and central 95 % intervals" in methods_paragraph(skewed)
+    assert "of skewed posteriors, medians and central 95 % intervals" in page
     fit = Fit(**{field.name: getattr(skewed, field.name) for field in dataclasses.fields(skewed)})
     assert "v_s = 400 (3.2 to 1900) m/s" in repr(fit)
     for text in (table, page, latex_table(skewed), repr(fit)):

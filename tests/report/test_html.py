@@ -14,7 +14,7 @@ from capsule_id.api import read_rig
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.report.columns import table_rows, verdict_text
-from capsule_id.report.html import Picture, methods_paragraph, pictures, render
+from capsule_id.report.html import Picture, pictures, render
 from capsule_id.report.messages import TERMS, finding_text, messages_of
 from capsule_id.views import Finding, Message, ResultTable, Text
 from tests.cli_tools import DATA
@@ -154,11 +154,17 @@ def test_a_shared_panel_has_the_level_of_its_checks(result: Result, drawn: tuple
 
 def test_the_methods_paragraph_counts_the_fitted_experiments(result: Result) -> None:
     fitted_bench = replace(result, rig=read_rig(DATA))
-    text = methods_paragraph(fitted_bench)
+    text = methods_of(fitted_bench)
     assert "3 x free vibration" in text
     assert "forced run" not in text
     everything = replace(fitted_bench, provenance=replace(fitted_bench.provenance, experiments="all"))
-    assert "4 x forced run" in methods_paragraph(everything)
+    assert "4 x forced run" in methods_of(everything)
+
+
+def methods_of(result: Result) -> str:
+    """The methods paragraph of the page, in one line."""
+    (text,) = re.findall(r'<pre id="copy-methods" tabindex="0">(.*)</pre>', render(result, ()))
+    return html.unescape(text)
 
 
 def test_terms_of_the_first_screen_are_explained(page: str) -> None:

@@ -87,11 +87,8 @@ def residuals(item: Comparison, ax: Axes) -> None:
     if item.residuals is None or item.residual_x is None:
         raise ValueError(f"{item.label} has no residuals")
     many = item.residuals.size > _MANY
-    ax.axhspan(-TWO_SIDED_95, TWO_SIDED_95, color=BLUE, alpha=0.13, lw=0)
-    ax.axhline(0.0, color=GREY, lw=0.8)
+    _about_zero(ax, TWO_SIDED_95, 1.1 * max(3.0, _largest(item.residuals)))
     ax.plot(item.residual_x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
-    limit = 1.1 * max(3.0, _largest(item.residuals))
-    ax.set_ylim(-limit, limit)
     set_text(ax, item.x_label, "residual / sd [1]")
 
 
@@ -106,14 +103,18 @@ def autocorrelation(item: Comparison, ax: Axes) -> None:
     if item.autocorrelation is None:
         raise ValueError(f"{item.label} has no autocorrelation")
     bound = item.autocorrelation_bound or 0.0
-    if bound:
-        ax.axhspan(-bound, bound, color=BLUE, alpha=0.13, lw=0, label="95 % of white records")
-    ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.vlines(np.arange(1, item.autocorrelation.size + 1), 0.0, item.autocorrelation, color=BLACK, lw=1.3)
     limit = 1.25 * max(_largest(item.autocorrelation), 2.0 * bound, 0.05)
-    ax.set_ylim(-limit, limit)
+    _about_zero(ax, bound, limit, "95 % of white records" if bound else None)
+    ax.vlines(np.arange(1, item.autocorrelation.size + 1), 0.0, item.autocorrelation, color=BLACK, lw=1.3)
     set_text(ax, "lag [samples]", "autocorrelation [1]")
     set_legend(ax, "above")  # bars of a coloured record reach everywhere
+
+
+def _about_zero(ax: Axes, bound: float, limit: float, label: str | None = None) -> None:
+    """An axis from -limit to limit, with its zero and a band from -bound to bound."""
+    ax.axhspan(-bound, bound, color=BLUE, alpha=0.13, lw=0, label=label)
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    ax.set_ylim(-limit, limit)
 
 
 def _largest(values: np.ndarray) -> float:

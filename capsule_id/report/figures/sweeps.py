@@ -5,8 +5,9 @@ Datasets come from ``motions.sweep`` in SI; ``in_units`` says in what units the 
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -115,11 +116,15 @@ def _axis_label(data: xr.Dataset, over: str) -> str:
     return f"{over}, {data[over].attrs['units']}"
 
 
-def _above_each_other(title: str, **margins: float) -> tuple[Figure, Axes, Axes]:
+def _above_each_other(title: str, *panels: Callable[[Axes], None], **margins: float) -> Figure:
+    """Two panels over the same values."""
     figure = new_figure(7.4, 6.6, **margins)
     figure.text(0.01, 0.99, title, fontsize=SMALL, va="top", fontweight="bold", parse_math=False)
-    upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.0, 1.15]})
-    return figure, upper, lower
+    axes = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.0, 1.15]})
+    for ax, panel in zip(axes, panels, strict=True):
+        panel(ax)
+    axes[0].set_xlabel("")
+    return figure
 
 
 # sweeps: Bifurcation diagrams: Poincaré section, mean velocity, labels, and measured runs beside them.
@@ -127,11 +132,8 @@ def _above_each_other(title: str, **margins: float) -> tuple[Figure, Axes, Axes]
 
 def bifurcation(data: xr.Dataset, measured: Sequence[MeasuredPoint] = (), title: str = "") -> Figure:
     """A Dataset over (branch, <quantity>): Poincaré section above, mean velocity and the motions' labels below."""
-    figure, upper, lower = _above_each_other(title, top=0.46, hspace=0.2)
-    poincare(data, upper)
-    upper.set_xlabel("")
-    mean_velocity(data, measured, lower)
-    return figure
+    panels = partial(poincare, data), partial(mean_velocity, data, measured)
+    return _above_each_other(title, *panels, top=0.46, hspace=0.2)
 
 
 def poincare(data: xr.Dataset, ax: Axes) -> None:
@@ -219,11 +221,9 @@ def _dots(ax: Axes, x: np.ndarray, y: np.ndarray, **look: object) -> None:
 
 def bands(data: xr.Dataset, title: str = "") -> Figure:
     """A Dataset of ``operating.bands``: probability of each motion above, objective with its band below."""
-    figure, upper, lower = _above_each_other(title, right=1.66, hspace=0.14)
-    probabilities(data, upper)
-    upper.set_xlabel("")
-    objective_band(data, lower)
-    return figure
+    return _above_each_other(
+        title, partial(probabilities, data), partial(objective_band, data), right=1.66, hspace=0.14
+    )
 
 
 def probabilities(data: xr.Dataset, ax: Axes) -> None:

@@ -9,17 +9,10 @@ from pathlib import Path
 
 from capsule_id.rig.formats.binary import read_hdf5, read_mat, read_npz, read_parquet, read_tdms, read_xlsx
 from capsule_id.rig.formats.layouts import read_lvm, read_text
-from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, RawTable
+from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout
 from capsule_id.rig.formats.text import read_csv
 
-TEXTS: Mapping[str, Callable[[bytes, Path, Layout], Export]] = {
-    ".csv": read_text,
-    ".txt": read_text,
-    ".tsv": read_text,
-    ".dat": read_text,
-    ".lvm": read_lvm,
-}
-_TABLES: Mapping[str, Callable[[bytes, Path], RawTable]] = {".csv": read_csv, ".txt": read_csv, ".tsv": read_csv}
+TEXTS = {**dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), read_text), ".lvm": read_lvm}
 
 
 def suffix_of(path: Path) -> str:
@@ -28,10 +21,7 @@ def suffix_of(path: Path) -> str:
     return Path(path.stem).suffix.lower() + last if last == COMPRESSED else last
 
 
-READERS: Mapping[str, Callable[[bytes, Path], RawTable]] = {
-    **_TABLES,
-    **{suffix + COMPRESSED: read for suffix, read in _TABLES.items()},
-}
+READERS = dict.fromkeys((suffix + end for suffix in (".csv", ".txt", ".tsv") for end in ("", COMPRESSED)), read_csv)
 EXPORTS: Mapping[str, Callable[[bytes, Path, Layout], Export]] = {
     **TEXTS,
     **{suffix + COMPRESSED: read for suffix, read in TEXTS.items()},

@@ -11,8 +11,8 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, partial
 from importlib import import_module
 from math import prod
 from pathlib import Path
@@ -43,38 +43,33 @@ from capsule_id.views import counted
 Named = Iterator[tuple[str, np.ndarray | None, str]]  #: name, numbers (None: no real numbers), unit ("": not stated)
 
 
-@dataclass(frozen=True)
-class ArraysReader:
-    """Reads the arrays of a file as columns, by name. ``missing`` of a layout may hold "NaN"; the rest does not apply.
+def _read_arrays(
+    find: Callable[[bytes, Path], Named], remedy: str, package: str, content: bytes, path: Path, layout: Layout
+) -> Export:
+    """The arrays of a file as columns, by name.
 
-    Attributes
+    Parameters
     ----------
     find : the adapter: bytes and name of a file -> its arrays
     remedy : for a damaged file
-    package : that reads it, where it is optional
+    package : that reads it, where it is optional; else ""
+    content, path : bytes and name of the file
+    layout : ``missing`` may hold "NaN"; the rest does not apply
+
+    Raises
+    ------
+    InputError
+        If the package is not installed, or the file is damaged, too large, or has no array of real numbers.
     """
-
-    find: Callable[[bytes, Path], Named]
-    remedy: str
-    package: str = ""
-
-    def __call__(self, content: bytes, path: Path, layout: Layout) -> Export:
-        """The columns of a file.
-
-        Raises
-        ------
-        InputError
-            If the package is not installed, or the file is damaged, too large, or has no array of real numbers.
-        """
-        if self.package:
-            require(self.package, path)
-        arrays, units, readings = dict[str, np.ndarray](), dict[str, str](), 0
-        with complete(path, self.remedy):
-            for name, array, units[name] in self.find(content, path):
-                if array is not None:
-                    arrays[name], readings = array, readings + array.size
-                    refuse_large(READING * readings, content, path)
-        return export_of_arrays(arrays, path, layout, units)
+    if package:
+        require(package, path)
+    arrays, units, readings = dict[str, np.ndarray](), dict[str, str](), 0
+    with complete(path, remedy):
+        for name, array, units[name] in find(content, path):
+            if array is not None:
+                arrays[name], readings = array, readings + array.size
+                refuse_large(READING * readings, content, path)
+    return export_of_arrays(arrays, path, layout, units)
 
 
 # hdf5: Reads HDF5 files, among them MATLAB files of version 7.3: every real numeric data set is a column, or a matrix.
@@ -225,7 +220,7 @@ def _written(found: Any) -> np.ndarray:
     return np.where(written, array, np.nan)
 
 
-read_hdf5 = ArraysReader(_data_sets, "export it again")
+read_hdf5 = partial(_read_arrays, _data_sets, "export it again", "")
 
 
 # mat: Reads MATLAB files: every real numeric variable is a column, of a matrix every column; so is a field of a struct.
@@ -280,7 +275,7 @@ def _variables(content: bytes, path: Path) -> Named:
             yield name, values, ""
 
 
-_read_mat_5 = ArraysReader(_variables, "save it again by save(..., '-v7')")
+_read_mat_5 = partial(_read_arrays, _variables, "save it again by save(..., '-v7')", "")
 
 
 def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
@@ -372,7 +367,7 @@ def _numbers(content: bytes) -> np.ndarray | None:
     return np.lib.format.read_array(stream, allow_pickle=False)
 
 
-read_npz = ArraysReader(_members, "write it again by numpy.savez")
+read_npz = partial(_read_arrays, _members, "write it again by numpy.savez", "")
 
 
 # parquet: Reads Parquet files: every column of real numbers. pyarrow, the reference implementation, decodes them.
@@ -400,7 +395,7 @@ def _columns(content: bytes, path: Path) -> Named:
     yield from ((name, table.column(name).to_numpy(), "") for name in table.column_names)
 
 
-read_parquet = ArraysReader(_columns, "write it again", "pyarrow")
+read_parquet = partial(_read_arrays, _columns, "write it again", "pyarrow")
 
 
 # tdms: Reads TDMS files of LabVIEW by npTDMS: every channel of numbers, scaled, and the times of waveforms.
@@ -452,7 +447,7 @@ def _clock(channel: Any) -> tuple[float, float] | None:
     return (float(offset) if isinstance(offset, int | float) and np.isfinite(offset) else 0.0), float(increment)
 
 
-read_tdms = ArraysReader(_channels, "export it again, or as text", "npTDMS")
+read_tdms = partial(_read_arrays, _channels, "export it again, or as text", "npTDMS")
 
 
 # xlsx: Reads Excel workbooks: the first sheet with numbers, as the text table that it would be saved to.

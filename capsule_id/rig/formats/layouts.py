@@ -143,7 +143,7 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
             if i + 1 >= layout.data_from_line and line.strip():
                 return lines
             continue
-        cells = _split(line, delimiter_of(line, layout))
+        cells = split_bare(line, delimiter_of(line, layout))
         if begun is None and any(is_number(cell) for cell in cells):
             begun, cells = i, _mapped(cells, lines, layout)
         if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
@@ -207,7 +207,7 @@ def _headers(line: str, delimiter: str | None, width: int) -> tuple[str, ...]:
 
 def _header_cells(line: str, delimiter: str | None) -> Iterator[list[str]]:
     """Ways to split a line of headers: as the readings, else with quotation marks, or with another separator."""
-    yield _split(line, delimiter)
+    yield split_bare(line, delimiter)
     if delimiter is None:  # headers of several words, two spaces or more between them
         yield re.split(r"\s{2,}", line.strip())
     for mark in (delimiter, "\t", ";", ","):
@@ -217,7 +217,7 @@ def _header_cells(line: str, delimiter: str | None) -> Iterator[list[str]]:
                 yield [bare(cell) for cell in cells]
 
 
-def _split(line: str, delimiter: str | None) -> list[str]:
+def split_bare(line: str, delimiter: str | None) -> list[str]:
     """The cells of a line without blanks and quotation marks around them."""
     return [bare(cell) for cell in texts_of(line, delimiter)]
 
@@ -232,7 +232,7 @@ def delimiter_of(line: str, layout: Layout) -> str | None:
         return None if len(words) > 1 else "\t"
     if "," not in line:
         return None if len(words) > 1 else ","
-    if all(_is_reading(cell, layout) for cell in _split(line, ",")):
+    if all(_is_reading(cell, layout) for cell in split_bare(line, ",")):
         return ","
     return None if len(words) > 1 and all(_is_reading(word, layout) for word in words) else ","
 

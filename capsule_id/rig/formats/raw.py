@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -148,11 +148,6 @@ class TextFile:
                 raise InputError(rule, "a longer one", remedy, self.path, self._text.count(b"\n", 0, begin) + 1, 1)
             begin = end
 
-    def has_cell(self, text: str) -> bool:
-        """Whether a text stands between any two separators, or at the beginning or the end of a line."""
-        pattern = rb'(?:^|[,;\t ])"?%s"?(?:$|[,;\t ])' % re.escape(text.encode())
-        return re.search(pattern, self._text.rstrip(b"\n"), re.MULTILINE) is not None
-
     def blocks(self, first: int = 0) -> Iterator[tuple[int, bytes]]:
         """Blocks of lines from line ``first``, counted from 0: the number of their first line, and their text in UTF-8.
 
@@ -264,6 +259,14 @@ class RawTable:
     missing: int = 0
     other: int = 0
     rejected: int = 0
+
+    def taken(self, rows: np.ndarray) -> "RawTable":
+        """The table with the rows of these indices, (k,), alone."""
+
+        def place(row: int | None, column: int) -> Place:
+            return self.place(None if row is None else int(rows[row]), column)
+
+        return replace(self, columns=tuple(one[rows] for one in self.columns), rows=self.rows[rows], place=place)
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""

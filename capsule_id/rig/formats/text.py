@@ -47,9 +47,7 @@ def cells_of(line: str, delimiter: str | None) -> list[tuple[str, int]]:
 
 def texts_of(line: str, delimiter: str | None) -> list[str]:
     """The cells of a line without their places, as ``cells_of``."""
-    if delimiter is None:
-        return re.findall(rf"[^{BLANKS}]+", line)
-    return [cell.strip(BLANKS) for cell in line.split(delimiter)]
+    return [cell for cell, _ in cells_of(line, delimiter)]
 
 
 def place_of_cell(line: str, delimiter: str | None, column: int, absent: int = 1) -> int:
@@ -388,7 +386,7 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
 
 #: What exports write where there is no reading, in small letters, without signs.
 _NO_READING = ("", "nan", "inf", "infinity", "na", "n/a", "#n/a", "null", "none")
-HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
+_HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 
 
 class MissingCellsError(InputError):
@@ -451,7 +449,7 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
         bare = cell[1:-1].strip() if len(cell) > 1 and cell[0] == cell[-1] == '"' else cell
         if not bare:
             raise InputError("every column must have a header", "an empty cell", remedy, path, 1, column)
-        found = HEADER_CELL.fullmatch(bare)
+        found = _HEADER_CELL.fullmatch(bare)
         if found is None or not found[2].strip():
             raise InputError("the first line must be headers `name [unit]`", shown_cell(bare), remedy, path, 1, column)
         if found[1] in units:
