@@ -306,15 +306,13 @@ class Screening:
         starts from rough estimates.
         """
         start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
-        sloped = float(model.drift == "linear")
-
         jacobians: dict[bytes, np.ndarray] = {}
         unit = float(np.std(self.values))
 
         def whitened(whole: np.ndarray) -> np.ndarray:
             """(names + 1, n) residuals at as many scaled unknowns."""
             thetas, motion = self.motions(whole)
-            return np.asarray(_whitened(self.times, self.values - motion, thetas, sloped)[0]) / unit
+            return np.asarray(_whitened(self.times, self.values - motion, thetas, model.drift == "linear")[0]) / unit
 
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
