@@ -38,7 +38,7 @@ def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_fit_from_python_sets_the_options_of_xla(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """(Before: the commands alone did, and a fit from Python took three times as long.)"""
+    """(Before: the commands alone did, and a fit of a long decay from Python took twice as long.)"""
     monkeypatch.setattr(precision, "sys", SimpleNamespace(modules={}))
     monkeypatch.setenv("XLA_FLAGS", "")
     with pytest.raises(cid.InputError):
