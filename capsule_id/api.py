@@ -42,6 +42,7 @@ from capsule_id.physics.forces import warn_of_far_gap
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory
 from capsule_id.physics.simulation import simulate
+from capsule_id.precision import prepare_xla
 from capsule_id.report.columns import (
     errors_left_out,
     sampled_parameters,
@@ -382,6 +383,7 @@ def fit(
         If ``rig`` cannot be read or holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or
         ``ess`` is out of range, or ``friction`` cannot be fitted.
     """
+    prepare_xla()
     rig = rig if isinstance(rig, Rig) else read_rig(rig, registry, friction)
     if not isinstance(seed, int) or seed < 0:
         raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")

@@ -16,7 +16,7 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-from capsule_id.commands.compilation import XLA_EMITTER_OPTION
+from capsule_id.precision import XLA_EMITTER_OPTION
 from tests.capsule_cases import Cases, read_cases
 
 #: Programs that take longer than this to compile, s, are kept.
@@ -108,7 +108,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage again, less often, and not what was imported: each pass walks all modules and traces."""
+    """Collect garbage again, less often, and not what was imported: each pass walks all modules and traces.
+
+    XLA reads its options now: a fit sets them as for a command where nothing has been computed.
+    """
+    jax.devices()
     gc.enable()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)

@@ -15,10 +15,8 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-# XLA then compiles each loop of an engine as one function: fits and batches are faster. CPU only.
-XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
-# Without XLA's newer emitters of fused loops a program compiles in half the time, and runs no slower. CPU only.
-XLA_EMITTER_OPTION = "--xla_cpu_use_fusion_emitters=false"
+from capsule_id.precision import prepare_xla
+
 #: Variable with the number of threads of OpenBLAS, which NumPy and SciPy bring.
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 #: Variables of JAX, unless the user has set them: largest size of the cache, bytes, beyond which it removes the programs that
@@ -39,21 +37,13 @@ def use_one_blas_thread() -> None:
         os.environ.setdefault(BLAS_THREADS, "1")
 
 
-def prepare_jax(cached: bool, loop: bool = True) -> None:
-    """Set the options of XLA for this process, unless JAX has computed something; those that the user has set stay.
+def prepare_jax(cached: bool) -> None:
+    """Set the options of XLA for this process, see ``prepare_xla``.
 
     cached : keep compiled programs in the user's cache directory too; JAX's own variables, where set, have precedence.
         Processes share the cache under a file lock. Nothing is kept where the directory cannot be written
-    loop : set ``XLA_LOOP_OPTION`` too
     """
-    bridge = sys.modules.get("jax._src.xla_bridge")
-    if bridge is not None and getattr(bridge, "backends_are_initialized", lambda: True)():
-        return
-    for option in (XLA_EMITTER_OPTION, XLA_LOOP_OPTION)[: 1 + loop]:
-        flags = os.environ.get("XLA_FLAGS", "")
-        if option.partition("=")[0] not in flags:
-            os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
-    if not cached or DIRECTORY in os.environ:
+    if not prepare_xla() or not cached or DIRECTORY in os.environ:
         return
     directory = cache_directory()
     with suppress(OSError):

@@ -109,7 +109,7 @@ def fit_one(
         If the input is bad; then nothing is written.
     """
     check_output(directory, options)
-    prepare_jax(options.cached, rig.has_runs and options.experiments != "bench")
+    prepare_jax(options.cached)
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.report.html import render
     from capsule_id.report.messages import messages_of
@@ -179,7 +179,7 @@ def fit_many(
         raise InputError(rule, "it holds parameters.json", "choose another --out", root)
     for rig in rigs:
         check_output(root / rig.name, options)
-    prepare_jax(options.cached, any(rig.has_runs for rig in rigs) and options.experiments != "bench")
+    prepare_jax(options.cached)
     from capsule_id.report.messages import messages_of
 
     messages_of(kinds)
@@ -217,7 +217,7 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
     RuntimeError
         If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
     """
-    prepare_jax(options.cached, rig.has_runs and options.experiments != "bench")
+    prepare_jax(options.cached)
     from capsule_id.report.columns import wrapped
     from capsule_id.report.write import result_files
 

@@ -6,6 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
+import capsule_id as cid
+from capsule_id import precision
 from capsule_id.commands import compilation
 from tests.cli_tools import environment, run
 
@@ -14,8 +16,8 @@ MOTION = ("simulate", "--k2", "18960", "--P_d", "4", "--Omega", "34.56", "--G", 
 
 @pytest.mark.full
 def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules={}))
-    emitter, loop = compilation.XLA_EMITTER_OPTION, compilation.XLA_LOOP_OPTION
+    monkeypatch.setattr(precision, "sys", SimpleNamespace(modules={}))
+    emitter, loop = precision.XLA_EMITTER_OPTION, precision.XLA_LOOP_OPTION
     for before, after in (
         ("", f"{emitter} {loop}"),
         ("--xla_a=1", f"--xla_a=1 {emitter} {loop}"),
@@ -25,16 +27,23 @@ def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setenv("XLA_FLAGS", before)
         compilation.prepare_jax(cached=False)
         assert compilation.os.environ["XLA_FLAGS"].split() == after.split()
-    monkeypatch.setenv("XLA_FLAGS", "")
-    compilation.prepare_jax(cached=False, loop=False)
-    assert compilation.os.environ["XLA_FLAGS"] == emitter
     # JAX that has computed something has read its options; JAX that is only imported has not.
-    for computed, after in ((True, emitter), (False, f"{emitter} {loop}")):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    for computed, after in ((True, ""), (False, f"{emitter} {loop}")):
         bridge = SimpleNamespace(backends_are_initialized=lambda computed=computed: computed)
         modules = {"jax": None, "jax._src.xla_bridge": bridge}
-        monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules=modules))
+        monkeypatch.setattr(precision, "sys", SimpleNamespace(modules=modules))
         compilation.prepare_jax(cached=False)
         assert compilation.os.environ["XLA_FLAGS"].split() == after.split()
+
+
+def test_a_fit_from_python_sets_the_options_of_xla(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Before: the commands alone did, and a fit of a long decay from Python took twice as long.)"""
+    monkeypatch.setattr(precision, "sys", SimpleNamespace(modules={}))
+    monkeypatch.setenv("XLA_FLAGS", "")
+    with pytest.raises(cid.InputError):
+        cid.fit(tmp_path / "none")
+    assert os.environ["XLA_FLAGS"].split() == [precision.XLA_EMITTER_OPTION, precision.XLA_LOOP_OPTION]
 
 
 def test_blas_takes_one_thread(tmp_path: Path) -> None:
@@ -79,6 +88,7 @@ def variables(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, str]
     environ = {"XDG_CACHE_HOME": str(tmp_path), "HOME": str(tmp_path)}
     monkeypatch.setattr(compilation.os, "environ", environ)
     monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules={}))
+    monkeypatch.setattr(precision, "sys", SimpleNamespace(modules={}))
     return environ
 
 
@@ -106,11 +116,11 @@ def test_kinds_of_experiments_leave_the_options_of_xla_open(tmp_path: Path) -> N
     """They import JAX before a command sets its options: these act until JAX computes, and the cache is in use then."""
     before = (
         "import sys\nfrom capsule_id.experiments.kind import default_registry\ndefault_registry()\n"
-        "from capsule_id.commands import compilation\n"
+        "from capsule_id.commands import compilation\nfrom capsule_id.precision import XLA_LOOP_OPTION\n"
         "compilation.prepare_jax(cached=True)\nimport jax, os\n"
         "used = jax.config.jax_compilation_cache_dir\n"
         "assert used == os.environ[compilation.DIRECTORY] == str(compilation.cache_directory())\n"
-        "assert compilation.XLA_LOOP_OPTION in os.environ['XLA_FLAGS']\n"
+        "assert XLA_LOOP_OPTION in os.environ['XLA_FLAGS']\n"
         "assert jax.config.jax_persistent_cache_min_compile_time_secs == 0.3\n"
     )
     own = dict.fromkeys((name for name in os.environ if name.startswith(("JAX_", "XLA_"))), None)

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -36,6 +36,7 @@ from capsule_id.experiments.free_vibration.readings import (
 from capsule_id.experiments.free_vibration.record import DecayRecord, ReadingTimes, Screened, whiten_by_shape
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.physics.batches import pool
+from capsule_id.physics.exact.engine import as_one_function
 from capsule_id.records.tones import noise_level
 from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding
@@ -162,6 +163,8 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
 NAMES = tuple(BOUNDS)
 #: Those that are no logarithms, and those of which every record has its own values.
 LINEAR, OWN = ("F_dry", "c_q", "k_cubic", "turning_time"), ("amplitude", "turning_time")
+#: Motions that are computed together: one, and another for each unknown of a motion, which stand before those of the noise.
+ROWS = NAMES.index("noise_time") + 1
 
 
 def free_symbols(model: DecayModel) -> list[str]:
@@ -171,12 +174,14 @@ def free_symbols(model: DecayModel) -> list[str]:
 
 
 # Three programs compile faster than one, and the first serves records of every length.
-@partial(jax.jit, static_argnames="number")
-def _paths(thetas: Mapping[str, Any], number: int) -> HalfCycles:
-    """Half cycles of a batch of parameters."""
-    forces = {name: thetas[name] for name in ("k1", "c", "m1", "F_dry", "c_q", "k_cubic")}
-    path = partial(half_cycles, number=number, steps=min(STEPS, steps_of(number)))
-    return jax.vmap(path)(forces, thetas["amplitude"], thetas["turning_time"])
+@lru_cache(maxsize=32)
+def _paths(number: int) -> Callable[[Mapping[str, Any]], tuple[HalfCycles, Any]]:
+    """Program for half cycles of a batch of parameters; it also returns a number without meaning."""
+    path = jax.vmap(partial(half_cycles, number=number, steps=min(STEPS, steps_of(number))))
+    forces = ("k1", "c", "m1", "F_dry", "c_q", "k_cubic")
+    return as_one_function(
+        lambda theta: path({name: theta[name] for name in forces}, theta["amplitude"], theta["turning_time"])
+    )
 
 
 @partial(jax.jit, static_argnames="order")
@@ -185,7 +190,7 @@ def _readings(paths: HalfCycles, nodes: Any, weights: Any, order: int) -> Any:
     return jax.vmap(lambda path: block_mean(interpolate(path, nodes.ravel())[order], weights, jnp))(paths)
 
 
-@jax.jit
+@as_one_function
 def _whitened(times: ReadingTimes, raw: Any, thetas: Mapping[str, Any], sloped: Any) -> Any:
     """(batch, n) whitened residuals at the best offset and, where ``sloped`` is 1, the best slope."""
     time = times.time
@@ -256,13 +261,12 @@ class Screening:
         for name, value in (("F_dry", 0.02), ("c_q", 0.05), ("k_cubic", 0.0), ("drift_time", 1.0)):
             i = NAMES.index(name)
             z[i] = (z[i] or value * (not absent)) if name in free else 0.0
-        off = -1e3
         white = near is None or near[NAMES.index("white_ratio")] > BOUNDS["white_ratio"][1]
         if absent and white:
             z[NAMES.index("noise_time")] = BOUNDS["noise_time"][0]
         for name, value, unused in (
-            ("white_ratio", 0.0, off if model.noise == "ar1" else np.log(WHITE)),
-            ("drift_ratio", np.log(3.0), off),
+            ("white_ratio", 0.0, -1e3 if model.noise == "ar1" else np.log(WHITE)),
+            ("drift_ratio", np.log(3.0), -1e3),
         ):
             i = NAMES.index(name)
             known = near is not None and BOUNDS[name][0] < z[i] < BOUNDS[name][1]
@@ -302,15 +306,13 @@ class Screening:
         starts from rough estimates.
         """
         start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
-        sloped = float(model.drift == "linear")
-
         jacobians: dict[bytes, np.ndarray] = {}
         unit = float(np.std(self.values))
 
         def whitened(whole: np.ndarray) -> np.ndarray:
             """(names + 1, n) residuals at as many scaled unknowns."""
             thetas, motion = self.motions(whole)
-            return np.asarray(_whitened(self.times, self.values - motion, thetas, sloped)) / unit
+            return np.asarray(_whitened(self.times, self.values - motion, thetas, model.drift == "linear")[0]) / unit
 
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
@@ -344,19 +346,23 @@ class Screening:
         return self._summary(model, start, found, unit, tuple(one.values for one, _ in nested)), start
 
     def motions(self, whole: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
-        """Values by symbol and predicted readings (names + 1, n), SI, at as many scaled unknowns."""
+        """Values by symbol and predicted readings (batch, n), SI, at scaled unknowns (batch, names)."""
         thetas = self.theta(whole)
-        readings = _readings(_paths(thetas, self.number), self.nodes, self.weights, self.order)
-        return thetas, self.side * np.asarray(readings)
+        # Points that differ in noise or drift alone have one motion.
+        _, first, place = np.unique(whole[:, : ROWS - 1], axis=0, return_index=True, return_inverse=True)
+        parts = np.resize(first, (-(-len(first) // ROWS), ROWS))
+        paths = (_paths(self.number)({name: x[part] for name, x in thetas.items()})[0] for part in parts)
+        readings = [_readings(path, self.nodes, self.weights, self.order) for path in paths]
+        return thetas, self.side * np.concatenate(readings)[np.ravel(place)]
 
     def drowned(self, z: np.ndarray) -> bool:
         """Whether drift and noise at scaled unknowns (names,) are larger than the motion."""
-        motion = self.motions(np.tile(z, (len(NAMES) + 1, 1)))[1][0]
+        motion = self.motions(z[None])[1][0]
         return not np.std(self.values - motion) <= np.std(motion)
 
     def drift(self, z: np.ndarray) -> float:
         """Range of the mean over one period of measured minus predicted readings, SI, at scaled unknowns (names,)."""
-        raw = self.values - self.motions(np.tile(z, (len(NAMES) + 1, 1)))[1][0]
+        raw = self.values - self.motions(z[None])[1][0]
         time = self.times.time
         half = 0.5 * self.period
         first, last = np.searchsorted(time, time - half), np.searchsorted(time, time + half)
