@@ -162,7 +162,8 @@ class Experiment(eqx.Module):
 
     def unstated_errors(self, symbol: str) -> set[str]:
         """Of the errors ``INSTRUMENT_WORDS``, those that move the parameter ``symbol`` and that rig.toml does not state."""
-        return {"clock"} if "time" in self.table.columns and self.table.drift == NO_DRIFT else set()
+        stated = self.table.drift != NO_DRIFT or _logger(self.table) or "time" not in self.table.columns
+        return set() if stated else {"clock"}
 
     @property
     def work(self) -> int:

@@ -301,7 +301,9 @@ class Line(PointTest):
         return theta[self.symbol] * x[self.x_name]
 
     def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
-        return {self.x_name: theta[self.symbol]}
+        """The slope of the readings, which the gains of both instruments change."""
+        factors = (self.instrument(name, theta)[0] for name in (self.reading, self.x_name))
+        return {self.x_name: theta[self.symbol] * next(factors) / next(factors)}
 
     def design(self, n: int, xp: ModuleType = jnp) -> Any:
         return self.width * xp.ones((n, 1))
@@ -314,7 +316,7 @@ class Line(PointTest):
             return (plain,)
         # Readings scatter in x too. The ratio of both errors must not depend on the scatter: its density would then have
         # no upper limit at 0.
-        total = 1.0 + (theta[self.symbol] / self.sd_ratio) ** 2
+        total = 1.0 + (self.slopes(theta)[self.x_name] / self.sd_ratio) ** 2
         return (replace(plain, scale=xp.sqrt(total), ordinate=(plain.fixed_variance / total, 1.0)),)
 
     def ordinary_line(self) -> tuple[float, float, float]:

@@ -109,7 +109,7 @@ class PointTest(GroundExperiment):
         )
 
     def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
-        """Derivative of the prediction by each column of ``uncertain``, by name; () or (n,)."""
+        """Derivative of what is shown by each column of ``uncertain``, by name; () or (n,)."""
         return _slopes(self, theta) if self.uncertain else {}
 
     def change(self, theta: ValuesBySymbol) -> Any:
@@ -136,7 +136,8 @@ class PointTest(GroundExperiment):
         raw = self.observed - xp.asarray(self.shown(theta, self.readings))
         carried = ((slope * self.sds[name]) ** 2 for name, slope in self.slopes(theta).items())
         variance = sum(carried, self.sds[self.reading] ** 2)
-        return (Misfit(raw, variance, self.change(theta), self.design(self.n, xp)),)
+        size = self.instrument(self.reading, theta)[0] if self.relative else 1.0
+        return (Misfit(raw, variance, size * self.change(theta), self.design(self.n, xp)),)
 
     def starts(self) -> dict[str, Start]:
         """None: parameters start at the medians of their priors."""
@@ -182,6 +183,6 @@ def _slopes(test: PointTest, theta: ValuesBySymbol) -> dict[str, jax.Array]:
 
     def slope(name: str) -> jax.Array:
         x = test.readings[name]
-        return jax.jvp(lambda x: test.predict(theta, {**test.readings, name: x}), (x,), (jnp.ones_like(x),))[1]
+        return jax.jvp(lambda x: test.shown(theta, {**test.readings, name: x}), (x,), (jnp.ones_like(x),))[1]
 
     return {name: slope(name) for name in test.uncertain}

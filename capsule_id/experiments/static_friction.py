@@ -185,7 +185,7 @@ class StaticFriction(FrictionExperiment):
     def _angle(self, ratio: Any) -> Any:
         """The angle, rad, of a height over a length."""
         xp = array_module(ratio)
-        return xp.arcsin(ratio) if self.side == "board" else xp.arctan(ratio)
+        return xp.arcsin(xp.minimum(ratio, 1.0)) if self.side == "board" else xp.arctan(ratio)
 
     def shown(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
         """The angle of the height and the length that their instruments read."""

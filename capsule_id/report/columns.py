@@ -216,7 +216,7 @@ def errors_left_out(frame: pd.DataFrame) -> list[str]:
         return []
     parts = "; ".join(f"{word}: {', '.join(names[word])}" for word in found)
     words = " or ".join(filter(None, [", ".join(found[:-1]), found[-1]]))
-    return [f"the sd contains no error of {words} ({parts}); an [[instrument]] in rig.toml states them"]
+    return [f"the sd contains no error of {words} ({parts}). How to state them: guide, parameters, Instruments"]
 
 
 def _ends(values: Mapping[Hashable, Any], suffix: str = "") -> list[float] | None:

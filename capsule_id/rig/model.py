@@ -65,6 +65,10 @@ class Instrument:
         pairs = (("gain", self.gain), ("offset", self.offset))
         return {symbol: stated for symbol, stated in pairs if stated is not None}
 
+    def value(self, symbol: str) -> float:
+        """Stated value of an error, SI; 0 where it is not stated."""
+        return self.errors.get(symbol, NO_DRIFT).value
+
 
 @dataclass(frozen=True)
 class Column:
@@ -103,10 +107,11 @@ class Column:
         """
         if self.sd is not None or self.resolution is not None:
             return 0.0
-        values = self.values * self.to_display
+        gain, offset = (self.instrument.value(symbol) if self.instrument else 0.0 for symbol in ("gain", "offset"))
+        values = ((1.0 + gain) * self.values + offset) * self.to_display
         error = 1e-12 * float(np.max(np.abs(values), initial=0.0))
         digits = (10.0**-k for k in range(11) if np.max(np.abs(values - np.round(values, k))) <= error)
-        return next(digits, 0.0) / self.to_display
+        return next(digits, 0.0) / self.to_display / (1.0 + gain)
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,7 @@ def _read_experiments(
             tables.append(table)
             files |= sha256
     if not faults:
-        _refuse_idle_instruments(root, tables)
+        _refuse_idle_errors(root, tables)
     return tuple(tables), files
 
 
@@ -274,28 +274,36 @@ def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
 def _instruments(root: Node) -> dict[str, Node]:
     """The instruments of a rig, by name."""
     entries = root.get("instrument", [])
-    entries.require(isinstance(entries.value, list), "be a list of tables", "write [[instrument]]")
+    entries.require(isinstance(entries.value, list), "be tables", "write [[instrument]] above each")
     found: dict[str, Node] = {}
     for index in range(len(entries.value)):
-        node = entries[index].table("[[instrument]]", INSTRUMENT_KEYS)
-        name = node["name"].name() if "name" in node else ""
-        if not name or name in found or len(node.value) == 1:
-            rule = "an instrument must have a name of its own, and a gain, an offset or a clock"
-            raise node.error(rule, shown(node.value), "correct it, or remove it")
+        node = entries[index]
+        if not isinstance(node.value, dict) or "name" not in node:
+            remedy = 'write [[instrument]] and name = "..."'
+            raise node.error("an instrument must be a table with a name", shown(node.value), remedy)
+        node.refuse_unknown(INSTRUMENT_KEYS)
+        if (name := node["name"].name()) in found:
+            raise node["name"].error("instruments must have different names", shown(name), "rename one of them")
         found[name] = node
     return found
 
 
-def _refuse_idle_instruments(root: Node, tables: Sequence[Table]) -> None:
-    """Refuse an instrument that has read no column: a line of an experiment may be missing."""
-    used = {c.instrument.name for table in tables for c in table.columns.values() if c.instrument is not None}
+def _refuse_idle_errors(root: Node, tables: Sequence[Table]) -> None:
+    """Refuse an error of an instrument that acts on no column: a line of an experiment may be missing."""
+    columns = [
+        (name, column.instrument) for table in tables for name, column in table.columns.items() if column.instrument
+    ]
+    read = {(one.name, symbol) for name, one in columns for symbol in (("clock",) if name == "time" else one.errors)}
     for name, node in _instruments(root).items():
-        if name not in used:
-            rule, remedy = (
-                "an instrument must have read a column",
-                f'write <column>_instrument = "{name}" in an experiment',
-            )
-            raise node.error(rule, "none", remedy)
+        if name in [table.label for table in tables]:
+            raise node["name"].error("an instrument and an experiment have different names", shown(name), "rename it")
+        for key in node.value.keys() - {"name"}:
+            if (name, key) not in read:
+                column = "time" if key == "clock" else "<column>"
+                remedy = f'write {column}_instrument = "{name}" in an experiment, or remove {key}'
+                raise node[key].error(f"the {key} of an instrument must act on a column", "none", remedy, of_key=True)
+        if node.value.keys() == {"name"}:
+            raise node.error("an instrument must have a gain, an offset or a clock", "none", "state one")
 
 
 def _instrument_of(entry: Node, column: str) -> Node | None:
@@ -327,6 +335,7 @@ def _clock_of(entry: Node) -> Node | None:
 def _error_of(instrument: Node, key: str, si: str) -> Node:
     """An error of an instrument; without a value it is 0."""
     stated = instrument[key].table(f'{{ value = ..., sd = ..., unit = "{si}" }}')
+    stated.require(len(stated.value) > 1 or "unit" not in stated, "have a value or an sd", "state one, or remove it")
     return replace(stated, value={"value": 0.0, **stated.value})
 
 
@@ -341,23 +350,25 @@ def _with_instrument(entry: Node, column: Column, kind: KindRule) -> Column:
             "a gain is stated once", f"by {gain_sd} and by an instrument", f"remove {gain_sd}", of_key=True
         )
     known = kind.read_by if not kind.channels or gain_sd in kind.setting_rules else ()
-    pairs = [(symbol, si) for symbol, si in (("gain", "1"), ("offset", rule.si)) if symbol in node]
-    if not pairs or any(symbol not in known for symbol, _ in pairs):
-        rule_of_errors = f"of the instrument of {column.name}, {kind.name} reads {' and '.join(known) or 'nothing'}"
-        found = " and ".join(symbol for symbol, _ in pairs) or "neither"
-        raise place.error(rule_of_errors, found, "correct the instrument, or remove the line", of_key=True)
-    stated = {symbol: _error_of(node, symbol, si).quantity(si, ANY, has_sd=True) for symbol, si in pairs}
+    units = {symbol: si for symbol, si in (("gain", "1"), ("offset", rule.si)) if symbol in known and symbol in node}
+    if not units:
+        wanted = f"must state {' or '.join(known)}" if known else "cannot be stated, only that of time"
+        remedy = f"{'state it, or ' if known else ''}remove {column.name}_instrument"
+        text = f"the instrument of {column.name} of {kind.name} {wanted}"
+        raise place.error(text, shown(place.value), remedy, of_key=True)
+    stated = {symbol: _error_of(node, symbol, si).quantity(si, ANY, has_sd=True) for symbol, si in units.items()}
     instrument = Instrument(node["name"].value, rule.si, **stated)
-    gain, offset = (instrument.errors.get(symbol, Quantity(0.0)) for symbol in ("gain", "offset"))
+    gain, offset = instrument.errors.get("gain", NO_DRIFT), instrument.value("offset")
     if max(abs(gain.value), gain.sd) > LARGEST_GAIN:
         rule_of_gain = f"a gain is a relative error, at most {LARGEST_GAIN:g}"
         raise node["gain"].error(rule_of_gain, f"{gain.value:g} ± {gain.sd:g}", "write 0.01 for readings 1 % too large")
-    values = (column.values - offset.value) / (1.0 + gain.value)
+    values = (column.values - offset) / (1.0 + gain.value)
     if not rule.domain.holds(values).all():
         reached = f"{np.min(values) * column.to_display:g} {column.unit}"
         raise node.error(f"{column.name} without its errors must {rule.domain.text}", reached, "correct value or unit")
     values.flags.writeable = False
-    return replace(column, values=values, instrument=instrument)
+    sd, step = (size and size / (1.0 + gain.value) for size in (column.sd, column.resolution))
+    return replace(column, values=values, sd=sd, resolution=step, instrument=instrument)
 
 
 # order: Finds why the times of a table do not increase, and the remedy that cures this cause.

@@ -9,6 +9,9 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments
+from capsule_id.inference.checks.settings import outliers
+from capsule_id.inference.checks.verdict import has_own_nuisances
 from tests.rig.folder import write_folder
 
 HEAD = '[rig]\nname = "a"\nm1 = { value = 0.11, unit = "kg" }\nm2 = { value = 0.53, unit = "kg" }\n'
@@ -125,6 +128,43 @@ def test_coverage_over_eighty_benches(tmp_path: Path) -> None:
     assert np.mean(np.abs(z) > 3.0) <= 0.02
 
 
+def motor(folder: Path, rows: int, errors: str, gain: str) -> cid.Fit:
+    """A motor at ``rows`` currents, with errors of force and current, read by a load cell."""
+    rng, current = np.random.default_rng(5), np.linspace(0.25, 2.0, rows)
+    columns = {"force [N]": 2.0 * current, "current [A]": current}
+    text = HEAD + f'[[instrument]]\nname = "cell"\ngain = {gain}\n'
+    text += f'[[experiment]]\nkind = "motor_current"\nfile = "m.csv"\nforce_instrument = "cell"\n{errors}'
+    content = table(rng, columns, {"force [N]": 0.03, "current [A]": 0.01})
+    return cid.fit(cid.read_rig(write_folder(folder, text, {"m.csv": content})), budget=None)
+
+
+BOTH = 'force_sd = { value = 0.03, unit = "N" }\ncurrent_sd = { value = 0.01, unit = "A" }\n'
+
+
+@pytest.mark.parametrize("errors", [BOTH, 'sd_ratio = { value = 3, unit = "N/A" }\n'])
+def test_errors_of_both_columns_do_not_move_the_gain(tmp_path: Path, errors: str) -> None:
+    """Only the product of K and the gain is seen. Before: a gain of -1.4 sd at 200 rows, and K by as much too large."""
+    fitted, exact = (motor(tmp_path / sd, 200, errors, f'{{ value = 0, sd = {sd}, unit = "%" }}') for sd in ("2", "0"))
+    assert abs(fitted.nuisances.loc["gain[cell]", "value"]) < 0.05 * 0.02
+    assert fitted.summary.loc["K", "value"] == pytest.approx(exact.summary.loc["K", "value"], rel=1e-3)
+
+
+def test_an_instrument_hides_no_digit_and_no_outlier(tmp_path: Path) -> None:
+    """The stated gain is taken off, and the last digit of the readings is still known; so are outliers at a gain of 0."""
+    values = np.array([0.5, 1.0, 1.5, 2.0, 2.5, 9.0, 3.5, 4.0, 4.5, 5.0])
+    lines = "".join(f"{force},{force / 2.0 + 0.001 * (-1) ** i}\n" for i, force in enumerate(values.tolist()))
+    lines = lines.replace("9.0,4.499", "9.0,1.499")
+    for name, gain in (("none", '{ value = 0.5, unit = "%" }'), ("some", '{ value = 0.5, sd = 2, unit = "%" }')):
+        text = HEAD + f'[[instrument]]\nname = "cell"\ngain = {gain}\n'
+        text += '[[experiment]]\nkind = "motor_current"\nfile = "m.csv"\nforce_instrument = "cell"\n'
+        rig = cid.read_rig(write_folder(tmp_path / name, text, {"m.csv": "force [N],current [A]\n" + lines}))
+        (e,) = make_experiments(rig)
+        assert rig.tables[0].columns["force"].unstated_step == pytest.approx(0.1 / 1.005)
+        theta = e.local({"K": 2.0, "scatter[m]": 0.01, "gain[cell]": 1e-9, "m1": 0.11, "m2": 0.53, "g": 9.81})
+        assert [found.row for found in outliers(e, theta, 0.01)] == [5]
+        assert not has_own_nuisances(e)
+
+
 def test_heights_and_lengths_have_instruments(tmp_path: Path) -> None:
     """A ruler that reads 3 % too much on the height alone: mu of the base falls by it; of the board, by the sine."""
     for side, true in (("base", 0.5), ("board", 0.4)):
@@ -195,11 +235,11 @@ REFUSED = (
     ('name = "cell"\ngain = { sd = 1, k = 2, unit = "%" }', "", "k belongs to an expanded error"),
     ('name = "cell"\ngain = { expanded = 1, unit = "%" }', "", "add k = ..."),
     ('name = "cell"\noffset = { sd = 1, unit = "mm" }', "", "N"),
-    ('name = "cell"', "", "an instrument must have a name of its own, and a gain, an offset or a clock"),
+    ('name = "cell"', "", "the instrument of force of motor_current must state gain or offset"),
     (
         'name = "cell"\nclock = { sd = 1, unit = "ppm" }',
         "",
-        "motor_current reads gain and offset, neither",
+        "the instrument of force of motor_current must state gain or offset",
     ),
 )
 
@@ -216,7 +256,7 @@ def test_what_an_instrument_cannot_be(tmp_path: Path, instrument: str, setting: 
 
 def test_an_instrument_that_read_nothing_is_refused(tmp_path: Path) -> None:
     folder, _ = bench(tmp_path / "a", 3, stated=STATED, named=False)
-    with pytest.raises(InputError, match="an instrument must have read a column"):
+    with pytest.raises(InputError, match="the gain of an instrument must act on a column"):
         cid.read_rig(folder)
 
 
@@ -225,5 +265,7 @@ def test_a_channel_takes_the_clock_alone(tmp_path: Path) -> None:
     folder = write_folder(
         tmp_path / "a", text + 'file = "d.csv"\nx_rel_instrument = "a"\n', {"d.csv": decay(np.arange(100) / 400.0, 0)}
     )
-    with pytest.raises(InputError, match="of the instrument of x_rel, free_vibration reads nothing, gain"):
+    with pytest.raises(
+        InputError, match="the instrument of x_rel of free_vibration cannot be stated, only that of time"
+    ):
         cid.read_rig(folder)

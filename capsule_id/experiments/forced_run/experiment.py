@@ -241,9 +241,11 @@ class CapsuleRun(CapsuleForward):
 
     def unstated_errors(self, symbol: str) -> set[str]:
         """The offsets of all channels are free."""
-        read_by = dict(self.instruments)
-        gains = all(channel.gain_sd is not None or channel.name in read_by for channel in self.channels)
-        return super().unstated_errors(symbol) | (set() if gains else {"gain"})
+        known = {channel.name for channel in self.channels if channel.gain_sd is not None} | {
+            *dict(self.instruments),
+            "time",
+        }
+        return super().unstated_errors(symbol) | (set() if known.issuperset(self.table.columns) else {"gain"})
 
     def starts(self) -> dict[str, Start]:
         """Starts of the nuisances from the record, sampled or not; other parameters start at bench estimates or priors."""
@@ -541,6 +543,7 @@ def _misses(run: CapsuleRun, theta: ValuesBySymbol, x: np.ndarray, Y1: np.ndarra
     parts = []
     for channel, model in zip(run.channels, seen, strict=True):
         if channel.name != "current":
-            miss = (channel.values - model) / theta[f"noise_{channel.name}"]
+            seen_by = run.instrument(channel.name, theta)[0]
+            miss = (channel.values - seen_by * model) / theta[f"noise_{channel.name}"]
             parts.append(miss - np.mean(miss, axis=1, keepdims=True))
     return np.concatenate(parts, axis=1)

@@ -324,6 +324,10 @@ class TurningPoints(Decay):
         ]
         self.about = DecayAbout(table, rig, tuple(rows), screened, rough)
 
+    def unstated_errors(self, symbol: str) -> set[str]:
+        """Those of one side are amplitudes, counted from a zero that the readings do not show."""
+        return super().unstated_errors(symbol) | (set() if self.both_sides else {"zero"})
+
     @property
     def lines(self) -> str:
         return self.model.lines("damping", "stiffness")

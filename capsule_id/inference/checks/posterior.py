@@ -110,9 +110,10 @@ def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
 def check_agreement(s: SampledFit) -> list[Finding]:
     """Check that bench tests and runs are consistent (two-sided, Šidák over the shared parameters).
 
-    Masses are excluded, because both estimates contain their weighings.
+    Masses, slopes and errors of instruments are excluded, because both estimates contain what is stated of them.
     """
-    known = {row.name for e in s.experiments if not e.bench for row in e.parameters}
+    runs = [row.name for e in s.experiments if not e.bench for row in e.parameters]
+    known = {name for name in runs if not is_stated(name)}
     shared = [] if s.bench is None else [name for name in s.bench.names if name in known]
     if s.bench is None or not shared:
         return []
@@ -304,7 +305,7 @@ def conflicts(s: SampledFit) -> dict[str, dict[str, float]]:
     centre, sd = _location(s)
     found = {}
     for i, row in enumerate(s.target.parameters):
-        if not (row.physical or row.scatter or row.name in s.rig.priors):
+        if not (row.physical or row.scatter or is_stated(row.name) or row.name in s.rig.priors):
             continue
         prior = s.target.priors.at(i, np)
         middle, width = float(prior.centre), float(prior.width)

@@ -12,7 +12,7 @@ from capsule_id.experiments.friction import varies
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import SampledFit
-from capsule_id.parameters import is_stated
+from capsule_id.parameters import INSTRUMENT_ERRORS, is_stated
 from capsule_id.views import Facts, Finding
 
 # regression: Outliers by local regression diagnostics of one experiment at the point fit.
@@ -41,7 +41,10 @@ class Outlier:
 
 def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (n,) in units of the noise at the conditional mean of the nuisances, and J (n, p)."""
-    keys = [row.key for row in experiment.parameters if not row.scatter]
+    rows = [row for row in experiment.parameters if not row.scatter]
+    keys = [row.key for row in rows]
+    # The errors of instruments are near 0, and their sds are their sizes.
+    sizes = [row.prior.spread if row.prior and row.symbol in INSTRUMENT_ERRORS else 1e-12 for row in rows]
 
     def residuals(v: np.ndarray) -> np.ndarray:
         moved = {**theta, **dict(zip(keys, v, strict=True))}
@@ -49,7 +52,7 @@ def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, n
 
     misfit = experiment.misfit(theta)
     sd, at = misfit.sd, np.array([float(theta[s]) for s in keys])
-    raw = jacobian(residuals, at, DIFFERENCE * np.maximum(np.abs(at), 1e-12)) / sd[:, None]
+    raw = jacobian(residuals, at, DIFFERENCE * np.maximum(np.abs(at), sizes)) / sd[:, None]
     columns = np.concatenate([raw, misfit.design / sd[:, None]], axis=1)
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0.0] / size[size > 0.0]

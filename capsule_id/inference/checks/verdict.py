@@ -298,7 +298,7 @@ def beside_stated(s: SampledFit, found: Mapping[str, Widening]) -> dict[str, Wid
 
 def has_own_nuisances(e: Experiment) -> bool:
     """Whether ``e`` is a run, or a record with an amplitude of its own: its parts have other nuisances than the whole."""
-    return e.event_driven or any(not (row.physical or row.scatter) for row in e.parameters)
+    return e.event_driven or any(not (row.physical or row.scatter or is_stated(row.name)) for row in e.parameters)
 
 
 def widening(pairs: Sequence[tuple[float, float]]) -> Widening:
@@ -347,7 +347,10 @@ def estimates_of_parts(
 
 def rows_of_parts(e: Experiment, values: Mapping[str, float], number: int, by_load: bool) -> list[np.ndarray]:
     """Rows of the parts of ``e``; parameters as in ``estimates_of_parts``; [] for a table that is too short."""
-    unknowns = sum(not row.scatter for row in e.parameters) + e.misfit(e.local(values)).design.shape[1]
+    unknowns = (
+        sum(not (row.scatter or is_stated(row.name)) for row in e.parameters)
+        + e.misfit(e.local(values)).design.shape[1]
+    )
     rows = np.arange(len(e.table.rows))
     if e.time_series and e.n == len(rows):
         # Most of the energy of a record lies before it is all noise.
