@@ -96,12 +96,10 @@ class Fit(Result):
 
     @property
     def remarks(self) -> list[str]:
-        """Texts that the console shows under the table: a quoted model that is not the stated one, unusual magnitudes, and
-        errors of instruments that no sd contains.
-        """
+        """Texts that the console shows under the table: a quoted model that is not the stated one, and unusual magnitudes."""
         messages = messages_of(self.registry)
         found = [f for f in self.findings if f.code in messages and messages[f.code].on_console and f.level != "ok"]
-        return [*dict.fromkeys(self.text(f) for f in found), *errors_left_out(self.summary)]
+        return list(dict.fromkeys(self.text(f) for f in found))
 
     def text(self, item: Finding | ResultTable) -> str:
         """What a finding says (what was expected, what was found, what to do), or the caption of a table."""
@@ -117,14 +115,15 @@ class Fit(Result):
 
     @property
     def table(self) -> str:
-        """The parameter table with the remarks under it, as the console shows them."""
-        return "\n".join([table_text(self.summary, synthetic=self.rig.synthetic), *wrapped(self.remarks)])
+        """The parameter table as the console shows it, with the remarks and what no sd contains under it."""
+        under = wrapped([*self.remarks, *errors_left_out(self.summary)])
+        return "\n".join([table_text(self.summary, synthetic=self.rig.synthetic), *under])
 
     def __str__(self) -> str:
         return f"{self.table}\n{self.verdict}"
 
     def _repr_html_(self) -> str:
-        return summary_html(self, self.verdict, self.remarks)
+        return summary_html(self, self.verdict, [*self.remarks, *errors_left_out(self.summary)])
 
     def to_dataframe(self) -> pd.DataFrame:
         """The content of parameters.csv: a row per parameter, noise levels included (``role``), SI."""
