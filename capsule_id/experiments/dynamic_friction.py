@@ -225,9 +225,8 @@ class DynamicFriction(FrictionExperiment):
     def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
         """In closed form: NumPy residuals then need no compiled program."""
         track, speed = self.track(theta), self.true("speed", self.readings["speed"], theta)
-        factors = (self.instrument(name, theta)[0] for name in (self.reading, "speed"))
         braking = track.normal * track.braking(self.coefficient(theta).forward(speed))
-        return {"speed": speed / braking * next(factors) / next(factors)}
+        return {"speed": self.as_read(speed / braking, "speed", theta)}
 
     def change(self, theta: ValuesBySymbol) -> Any:
         return self.track(theta).change(self.coefficient(theta), self.readings["speed"])

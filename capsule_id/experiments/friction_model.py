@@ -335,12 +335,12 @@ class GroundExperiment(SurfaceExperiment):
 
     def instrument(self, column: str, theta: ValuesBySymbol) -> tuple[Any, Any]:
         """Factor and offset, SI, of ``readings`` of a column over the truth at ``theta``: the stated errors are taken off."""
-        gain, offset = (str(Name(symbol, dict(self.instruments).get(column, ""))) for symbol in INSTRUMENT_ERRORS)
-        stated = 1.0 + self.stated_errors.get(gain, 0.0), self.stated_errors.get(offset, 0.0)
+        name = dict(self.instruments).get(column, "")
+        gain, offset = (str(Name(symbol, name)) for symbol in INSTRUMENT_ERRORS)
+        stated_gain, stated_offset = (self.stated_errors.get(error, 0.0) for error in (gain, offset))
         # A fit of one table has no errors of instruments in theta.
-        return (1.0 + theta.get(gain, stated[0] - 1.0)) / stated[0], (
-            theta.get(offset, stated[1]) - stated[1]
-        ) / stated[0]
+        factor = (1.0 + theta.get(gain, stated_gain)) / (1.0 + stated_gain)
+        return factor, (theta.get(offset, stated_offset) - stated_offset) / (1.0 + stated_gain)
 
     def ground_at(self, theta: ValuesBySymbol) -> dict[str, Any]:
         """Slope, rad, and N0, N, at ``theta``, where they are not 0."""

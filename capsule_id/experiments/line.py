@@ -302,8 +302,7 @@ class Line(PointTest):
 
     def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
         """The slope of the readings, which the gains of both instruments change."""
-        factors = (self.instrument(name, theta)[0] for name in (self.reading, self.x_name))
-        return {self.x_name: theta[self.symbol] * next(factors) / next(factors)}
+        return {self.x_name: self.as_read(theta[self.symbol], self.x_name, theta)}
 
     def design(self, n: int, xp: ModuleType = jnp) -> Any:
         return self.width * xp.ones((n, 1))

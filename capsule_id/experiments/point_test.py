@@ -94,6 +94,10 @@ class PointTest(GroundExperiment):
         words = {"gain": "gain", "offset": "zero"}
         return {word for error, word in words.items() if not all(error in stated for stated in errors)}
 
+    def as_read(self, slope: Any, column: str, theta: ValuesBySymbol) -> Any:
+        """A derivative of the true reading by a true column, as the readings of both instruments show it."""
+        return slope * self.instrument(self.reading, theta)[0] / self.instrument(column, theta)[0]
+
     def true(self, column: str, values: Any, theta: ValuesBySymbol) -> Any:
         """What a column would read without the errors of its instrument at ``theta``."""
         factor, offset = self.instrument(column, theta)

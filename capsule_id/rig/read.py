@@ -22,11 +22,18 @@ from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
 from capsule_id.rig.formats.text import MissingCellsError
 from capsule_id.rig.guess import find_layout, proposal
-from capsule_id.rig.maps import MAP_KEYS, apply_map, on_reference, read_map
-from capsule_id.rig.model import NO_DRIFT, Column, Instrument, Quantity, Rig, Settings, Table
+from capsule_id.rig.maps import (
+    MAP_KEYS,
+    apply_map,
+    clock_of,
+    on_reference,
+    read_map,
+    refuse_idle_errors,
+    without_stated_errors,
+)
+from capsule_id.rig.model import NO_DRIFT, Column, Quantity, Rig, Settings, Table
 from capsule_id.rig.plateaus import read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import (
-    INSTRUMENT_KEYS,
     RIG_QUANTITIES,
     TABLE_KEYS,
     ColumnRule,
@@ -40,7 +47,7 @@ from capsule_id.rig.schema import (
     read_model,
     read_rules,
 )
-from capsule_id.rig.toml import ANY, LARGEST, NAME_PATTERN, SMALLEST, Node, closest, is_plausible, parse_toml, shown
+from capsule_id.rig.toml import LARGEST, NAME_PATTERN, SMALLEST, Node, closest, is_plausible, parse_toml, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 from capsule_id.views import counted
 
@@ -49,8 +56,6 @@ from capsule_id.views import counted
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
 _READING_ERRORS = ("_sd", "_resolution", "_instrument")
-#: Largest gain of an instrument and its sd: a gain of 0.01 reads 1 % too much.
-LARGEST_GAIN = 0.2
 #: Smallest stated reading error relative to the largest reading; below it rounding exceeds the error.
 SMALLEST_RELATIVE_ERROR = 1e-12
 
@@ -199,7 +204,7 @@ def _read_experiments(
             tables.append(table)
             files |= sha256
     if not faults:
-        _refuse_idle_errors(root, tables)
+        refuse_idle_errors(root, tables)
     return tuple(tables), files
 
 
@@ -243,7 +248,7 @@ def _read_experiment(
                 f"{key} needs a column {column}", f"columns {' '.join(table.columns)}", "remove it", of_key=True
             )
     columns = {
-        key: _with_instrument(entry, _with_reading_error(entry, column, kind), kind)
+        key: without_stated_errors(entry, _with_reading_error(entry, column, kind), kind)
         for key, column in table.columns.items()
     }
     table = replace(table, columns=MappingProxyType(columns))
@@ -266,109 +271,6 @@ def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
             )
         stated.append(size)
     return replace(column, sd=stated[0], resolution=stated[1])
-
-
-# instruments: ``[[instrument]]``, its clock, and the columns that it read.
-
-
-def _instruments(root: Node) -> dict[str, Node]:
-    """The instruments of a rig, by name."""
-    entries = root.get("instrument", [])
-    entries.require(isinstance(entries.value, list), "be tables", "write [[instrument]] above each")
-    found: dict[str, Node] = {}
-    for index in range(len(entries.value)):
-        node = entries[index]
-        if not isinstance(node.value, dict) or "name" not in node:
-            remedy = 'write [[instrument]] and name = "..."'
-            raise node.error("an instrument must be a table with a name", shown(node.value), remedy)
-        node.refuse_unknown(INSTRUMENT_KEYS)
-        if (name := node["name"].name()) in found:
-            raise node["name"].error("instruments must have different names", shown(name), "rename one of them")
-        found[name] = node
-    return found
-
-
-def _refuse_idle_errors(root: Node, tables: Sequence[Table]) -> None:
-    """Refuse an error of an instrument that acts on no column: a line of an experiment may be missing."""
-    columns = [
-        (name, column.instrument) for table in tables for name, column in table.columns.items() if column.instrument
-    ]
-    read = {(one.name, symbol) for name, one in columns for symbol in (("clock",) if name == "time" else one.errors)}
-    for name, node in _instruments(root).items():
-        if name in [table.label for table in tables]:
-            raise node["name"].error("an instrument and an experiment have different names", shown(name), "rename it")
-        for key in node.value.keys() - {"name"}:
-            if (name, key) not in read:
-                column = "time" if key == "clock" else "<column>"
-                remedy = f'write {column}_instrument = "{name}" in an experiment, or remove {key}'
-                raise node[key].error(f"the {key} of an instrument must act on a column", "none", remedy, of_key=True)
-        if node.value.keys() == {"name"}:
-            raise node.error("an instrument must have a gain, an offset or a clock", "none", "state one")
-
-
-def _instrument_of(entry: Node, column: str) -> Node | None:
-    """The instrument that read ``column`` in an experiment."""
-    key = f"{column}_instrument"
-    if key not in entry:
-        return None
-    known, name = _instruments(Node(entry.document, (), entry.document.data)), entry[key].text()
-    if name not in known:
-        near = closest(name, known)
-        remedy = f'write "{near}"' if near else f'add [[instrument]] with name = "{name}"'
-        raise entry[key].error("an experiment must name an instrument of rig.toml", shown(name), remedy)
-    return known[name]
-
-
-def _clock_of(entry: Node) -> Node | None:
-    """The clock of the instrument that read the times of an experiment."""
-    instrument = _instrument_of(entry, "time")
-    if instrument is None:
-        return None
-    if "clock" in entry or "clock" not in instrument:
-        key = entry["clock" if "clock" in entry else "time_instrument"]
-        rule = "a clock is stated once, by the experiment or by the instrument of its times"
-        value, remedy = ("both", "remove clock") if "clock" in entry else ("none", "give the instrument a clock")
-        raise key.error(rule, value, remedy, of_key=True)
-    return _error_of(instrument, "clock", "1")
-
-
-def _error_of(instrument: Node, key: str, si: str) -> Node:
-    """An error of an instrument; without a value it is 0."""
-    stated = instrument[key].table(f'{{ value = ..., sd = ..., unit = "{si}" }}')
-    stated.require(len(stated.value) > 1 or "unit" not in stated, "have a value or an sd", "state one, or remove it")
-    return replace(stated, value={"value": 0.0, **stated.value})
-
-
-def _with_instrument(entry: Node, column: Column, kind: KindRule) -> Column:
-    """The column without the stated errors of the instrument that read it."""
-    node = _instrument_of(entry, column.name)
-    if node is None or column.name == "time":
-        return column if node is None else replace(column, instrument=Instrument(node["name"].value))
-    place, rule, gain_sd = entry[f"{column.name}_instrument"], kind.columns[column.name], f"{column.name}_gain_sd"
-    if gain_sd in entry:
-        raise place.error(
-            "a gain is stated once", f"by {gain_sd} and by an instrument", f"remove {gain_sd}", of_key=True
-        )
-    known = kind.read_by if not kind.channels or gain_sd in kind.setting_rules else ()
-    units = {symbol: si for symbol, si in (("gain", "1"), ("offset", rule.si)) if symbol in known and symbol in node}
-    if not units:
-        wanted = f"must state {' or '.join(known)}" if known else "cannot be stated, only that of time"
-        remedy = f"{'state it, or ' if known else ''}remove {column.name}_instrument"
-        text = f"the instrument of {column.name} of {kind.name} {wanted}"
-        raise place.error(text, shown(place.value), remedy, of_key=True)
-    stated = {symbol: _error_of(node, symbol, si).quantity(si, ANY, has_sd=True) for symbol, si in units.items()}
-    instrument = Instrument(node["name"].value, rule.si, **stated)
-    gain, offset = instrument.errors.get("gain", NO_DRIFT), instrument.value("offset")
-    if max(abs(gain.value), gain.sd) > LARGEST_GAIN:
-        rule_of_gain = f"a gain is a relative error, at most {LARGEST_GAIN:g}"
-        raise node["gain"].error(rule_of_gain, f"{gain.value:g} ± {gain.sd:g}", "write 0.01 for readings 1 % too large")
-    values = (column.values - offset) / (1.0 + gain.value)
-    if not rule.domain.holds(values).all():
-        reached = f"{np.min(values) * column.to_display:g} {column.unit}"
-        raise node.error(f"{column.name} without its errors must {rule.domain.text}", reached, "correct value or unit")
-    values.flags.writeable = False
-    sd, step = (size and size / (1.0 + gain.value) for size in (column.sd, column.resolution))
-    return replace(column, values=values, sd=sd, resolution=step, instrument=instrument)
 
 
 # order: Finds why the times of a table do not increase, and the remedy that cures this cause.
@@ -496,7 +398,7 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
     drift = NO_DRIFT
     if "clock" in entry:
         raw, drift = on_reference(entry["clock"], raw)
-    if (clock := _clock_of(entry)) is not None:
+    if (clock := clock_of(entry)) is not None:
         raw, drift = on_reference(clock, raw)
     if "reject" in entry:
         raw = without_outliers(entry["reject"], raw, _times)

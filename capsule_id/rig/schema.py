@@ -329,6 +329,7 @@ TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
     "[rig]": ("name", "synthetic", "confirmed", *RIG_QUANTITIES),
     "[model]": ("friction", "free", "reaction", "engine"),
 }
+#: Keys of ``[[instrument]]``.
 INSTRUMENT_KEYS = ("name", "gain", "offset", "clock")
 
 

@@ -62,9 +62,7 @@ def test_the_gain_of_an_instrument_is_a_parameter_of_the_fit() -> None:
     seen, noise = [channels(0)[0] * 1.021 / 1.02, channels(0)[3]], (NOISE["noise_x_rel"], NOISE["noise_current"])
     observed = [recorded()[0].channels[name][:SAMPLES] for name in ("x_rel", "current")]
     parts = [density(y, s, sd**2 * np.eye(SAMPLES)) for y, s, sd in zip(observed, seen, noise, strict=True)]
-    assert float(run.log_likelihood(values, np)) == pytest.approx(
-        sum(parts), rel=1e-7
-    )  # residuals of a noise sd magnify rounding
+    assert float(run.log_likelihood(values, np)) == pytest.approx(sum(parts), rel=1e-9)
     assert float(run.log_likelihood({**values, "gain[lvdt]": 0.02}, np)) != pytest.approx(sum(parts), rel=1e-6)
     assert run.unstated_errors("k1") == {"clock", "gain"}
 
