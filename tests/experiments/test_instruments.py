@@ -10,7 +10,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.checks.settings import outliers
+from capsule_id.inference.checks.settings import basis_of, design, outliers
 from capsule_id.inference.checks.verdict import has_own_nuisances
 from tests.rig.folder import write_folder
 
@@ -162,7 +162,48 @@ def test_an_instrument_hides_no_digit_and_no_outlier(tmp_path: Path) -> None:
         assert rig.tables[0].columns["force"].unstated_step == pytest.approx(0.1 / 1.005)
         theta = e.local({"K": 2.0, "scatter[m]": 0.01, "gain[cell]": 1e-9, "m1": 0.11, "m2": 0.53, "g": 9.81})
         assert [found.row for found in outliers(e, theta, 0.01)] == [5]
+        # The gain moves the readings as K does, however near 0 it is: slope and intercept are all that the rows show.
+        assert {basis_of(design(e, {**theta, "gain[cell]": x})[1]).shape[1] for x in (1e-15, 1e-12, 1e-9, 1e-6)} == {2}
         assert not has_own_nuisances(e)
+
+
+def named_gains(folder: Path, seed: int, gain: float) -> set[str]:
+    """What the fit says is wrong where two cells, of 1 % and 0.2 %, read one spring, the first by ``gain`` too much."""
+    rng, deflection = np.random.default_rng(seed), np.linspace(0.0, 1.0, 11)
+    text = HEAD + "".join(
+        f'[[instrument]]\nname = "{name}"\ngain = {{ sd = {sd}, unit = "%" }}\n[[experiment]]\nkind = "support_spring"\n'
+        f'spring = "soft"\nfile = "of_{name}.csv"\nforce_instrument = "{name}"\n'
+        for name, sd in (("A", 1.0), ("B", 0.2))
+    )
+    files = {
+        f"of_{name}.csv": table(
+            rng,
+            {"deflection [mm]": deflection, "force [N]": (1.0 + error) * 2.4 * deflection},
+            {"deflection [mm]": 0.0, "force [N]": 2e-3},
+        )
+        for name, error in (("A", gain), ("B", 0.0))
+    }
+    fit = cid.fit(cid.read_rig(write_folder(folder, text, files)), budget=None)
+    return {
+        str(found.facts["name"]) for found in fit.findings if found.code == "priors.conflict" and found.level == "fail"
+    }
+
+
+def test_a_certificate_that_the_readings_contradict_is_named(tmp_path: Path) -> None:
+    """Five stated sds off; half of one is no contradiction."""
+    assert "gain[A]" in named_gains(tmp_path / "wrong", 0, 0.05)
+    assert named_gains(tmp_path / "right", 0, 0.005) == set()
+
+
+@pytest.mark.slow
+def test_contradicted_certificates_are_named(tmp_path: Path) -> None:
+    """Of 40 that are five sds off at least 80 % are named, of 40 that are right at most one."""
+    wrong = ["gain[A]" in named_gains(tmp_path / f"w{seed}", seed, 0.05) for seed in range(40)]
+    errors = 0.01 * np.random.default_rng(1).standard_normal(40)
+    right = [bool(named_gains(tmp_path / f"r{seed}", seed, error)) for seed, error in enumerate(errors)]
+    print(f"named: {sum(wrong)} of 40; false alarms: {sum(right)} of 40")
+    assert np.mean(wrong) >= 0.8
+    assert sum(right) <= 1
 
 
 def test_heights_and_lengths_have_instruments(tmp_path: Path) -> None:

@@ -1,11 +1,22 @@
 """Bench against runs: against closed forms, each with a negative control."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.inference.checks.posterior import Distance, RunsAlone, _by_sample, agreement, disagreement
+from capsule_id.inference.checks.posterior import (
+    Distance,
+    RunsAlone,
+    _by_sample,
+    agreement,
+    check_agreement,
+    disagreement,
+)
 from capsule_id.inference.result import PointFit
+from capsule_id.parameters import parameter
 from capsule_id.report.messages import FIT_MESSAGES, finding_text
 from capsule_id.views import Finding
 
@@ -95,3 +106,13 @@ def test_tails_follow_the_sample() -> None:
         assert _by_sample(draws, value, -1.0) == pytest.approx(expected, abs=0.35)
     # The normal density would call the farthest of these twelve sd.
     assert abs(_by_sample(draws, 12.0, -1.0)) < 5.0
+
+
+def test_what_rig_toml_states_is_no_independent_estimate() -> None:
+    """Bench and runs both hold the certificate of an instrument, the clock of a logger, the slope of the table."""
+    rows = [parameter("gain", "cell"), parameter("clock_drift", "logger"), parameter("slope")]
+    fitted: Any = SimpleNamespace(
+        experiments=[SimpleNamespace(bench=False, parameters=rows)],
+        bench=SimpleNamespace(names=tuple(row.name for row in rows)),
+    )
+    assert check_agreement(fitted) == []
