@@ -38,7 +38,7 @@ from capsule_id.inference.target import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.parameters import by_index, is_stated
 from capsule_id.physics.drive import Drive
-from capsule_id.physics.forces import warn_of_far_gap
+from capsule_id.physics.forces import Force, warn_of_far_gap
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory
 from capsule_id.physics.simulation import simulate
@@ -329,14 +329,19 @@ def _drawn_in_panels(
 # api: What the commands do, as functions: read a rig folder, fit it, load the result.
 
 
-def read_rig(folder: str | Path, registry: Registry | None = None, friction: type[FrictionLaw] | None = None) -> Rig:
+def read_rig(
+    folder: str | Path,
+    registry: Registry | None = None,
+    friction: type[FrictionLaw] | None = None,
+    contact: type[Force] | None = None,
+) -> Rig:
     """Read and check a rig folder.
 
     Parameters
     ----------
     folder : holds ``rig.toml`` and the tables that it names; or the path of ``rig.toml``
     registry : the kinds of experiments that it may have, by default the built-in ones and those of installed packages
-    friction : class of a friction law; ``[prior]`` may then state its parameters
+    friction, contact : classes of a friction law and of a contact; ``[prior]`` may then state their parameters
 
     Raises
     ------
@@ -345,7 +350,8 @@ def read_rig(folder: str | Path, registry: Registry | None = None, friction: typ
     """
     if not isinstance(folder, str | Path):
         raise InputError("the rig must be a path (str or Path)", type(folder).__name__, "name a folder with a rig.toml")
-    return read.read_rig(folder, registry or default_registry(), () if friction is None else friction.parameters)
+    own = tuple(row for law in (friction, contact) if law is not None for row in law.parameters)
+    return read.read_rig(folder, registry or default_registry(), own)
 
 
 def fit(
@@ -359,6 +365,7 @@ def fit(
     friction: type[FrictionLaw] | None = None,
     ess: float = DEFAULT_ESS,
     preliminary: Callable[[Fit], None] | None = None,
+    contact: type[Force] | None = None,
 ) -> Fit:
     """Fit a rig: point estimate, posterior, checks. The command ``fit-params`` chooses every one of the parameters.
 
@@ -375,15 +382,16 @@ def fit(
     friction : class of a friction law in place of eq. (1); its parameters are fitted instead of mu and v_s
     ess : sampling stops at this bulk and tail effective sample size of every parameter
     preliminary : called before the sampling with the point fit: a result without intervals, panels, notes and records
+    contact : class of a force in place of the support spring; its parameters are fitted instead of k2
 
     Raises
     ------
     InputError
         If ``rig`` cannot be read or holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or
-        ``ess`` is out of range, or ``friction`` cannot be fitted.
+        ``ess`` is out of range, or ``friction`` or ``contact`` cannot be fitted.
     """
     prepare_xla()
-    rig = rig if isinstance(rig, Rig) else read_rig(rig, registry, friction)
+    rig = rig if isinstance(rig, Rig) else read_rig(rig, registry, friction, contact)
     if not isinstance(seed, int) or seed < 0:
         raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")
     if budget is not None and budget < 1:
@@ -392,13 +400,13 @@ def fit(
         )
     if not 0 < ess < float("inf"):
         raise InputError("ess must be positive and finite", str(ess), f"give {DEFAULT_ESS:.0f}, the default")
-    law = friction_of(rig, friction)
+    law = friction_of(rig, friction, contact)
     kinds, seeds = registry or default_registry(), stage_seeds(seed)
     made_from = provenance(rig, seed, experiments, law.source)
     with Progress(progress) if isinstance(progress, bool | None) else nullcontext(progress) as show:
         show(0, 1, "point fit")
         readings = check_readings(rig, experiments, kinds)
-        made, second = second_models(make_experiments(rig, experiments, kinds, friction), readings)
+        made, second = second_models(make_experiments(rig, experiments, kinds, friction, contact), readings)
         target = LogPosterior(rig, made)
         point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
         before = (*readings, *second)

@@ -11,6 +11,7 @@ from capsule_id.rig.model import Rig, Table
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
+    from capsule_id.physics.forces import Force
     from capsule_id.physics.friction import FrictionLaw
     from capsule_id.views import Comparison
 
@@ -40,6 +41,7 @@ def make_experiments(
     experiments: Choice = "all",
     registry: Registry | None = None,
     friction: "type[FrictionLaw] | None" = None,
+    contact: "type[Force] | None" = None,
 ) -> tuple["Experiment", ...]:
     """Make the selected experiments of the rig, in the order of ``rig.toml``.
 
@@ -48,12 +50,13 @@ def make_experiments(
     experiments : one of ``CHOICES``
     registry : kinds of experiments of the rig, by default all
     friction : class of the friction law, by default eq. (1)
+    contact : class of the force of the support, by default the linear spring k2
 
     Raises
     ------
     InputError
         If there is nothing to fit, the tables of a kind cannot be fitted together, ``experiments`` is unknown, or
-        ``friction`` cannot be fitted.
+        ``friction`` or ``contact`` cannot be fitted.
     """
     kinds = registry or default_registry()
     tables = select_tables(rig, experiments)
@@ -65,14 +68,22 @@ def make_experiments(
     # The law loads JAX, which takes seconds. A faulty folder must be reported before.
     from capsule_id.experiments.friction_model import EQUATION_1, friction_of
 
-    model = friction_of(rig, friction)
+    model = friction_of(rig, friction, contact)
     model.check(kinds.parameters)
     made = tuple(e for table in tables for e in kinds[table.kind].make(table, rig, model))
     absent = {row.symbol for row in EQUATION_1.law.parameters} - {row.symbol for row in model.law.parameters}
+    absent |= set() if contact is None else {"k2"}
     for e in made:
         if taken := absent.intersection(row.symbol for row in e.parameters):
-            rule = f"the kind {e.kind} reads {min(taken)} of eq. (1), which the friction law {model.name} replaces"
+            rule = f"the kind {e.kind} reads {min(taken)}, which {model.name} replaces"
             raise InputError(rule, e.label, f"remove {e.label}, or fit without this law", rig.folder / "rig.toml")
+    springs = sorted({str(t.settings.spring) for t in tables if getattr(t.settings, "spring", None) is not None})
+    if contact is not None and len(springs) > 1:
+        rule, remedy = (
+            f"the contact {contact.__name__} describes one spring",
+            "fit the runs of each spring by themselves",
+        )
+        raise InputError(rule, ", ".join(springs), remedy, rig.folder / "rig.toml")
     measured = {row.symbol for e in made for row in e.parameters}
     for symbol in rig.model.free if experiments == "all" else ():
         if symbol not in measured:

@@ -6,6 +6,7 @@ from types import ModuleType
 from typing import Any, Literal, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,6 +64,10 @@ def stated_starts(of: str, **quantities: Quantity | None) -> dict[str, Start]:
     return {f"{symbol}[{of}]": Start(q.value, 0.5 * q.sd / q.value) for symbol, q in uncertain.items()}
 
 
+#: Widths a quarter of the certified ones.
+NARROW = Smoothing(*(0.25 * width for width in jax.tree.leaves(Smoothing())))
+
+
 class CapsuleForward(GroundExperiment):
     """An experiment that the capsule model predicts.
 
@@ -86,23 +91,27 @@ class CapsuleForward(GroundExperiment):
         self.reaction = rig.model.share_of_reaction
 
     def with_smoothing(self, widths: Smoothing | None) -> Self:
-        """Return the same readings with the smoothed model of ``widths``; None: the exact model."""
+        """Return the same readings with the smoothed model of ``widths``; None: the exact model, or ``NARROW`` widths.
+
+        A contact of one's own has these widths where [model] chooses the smoothed engine: the exact one need not take it.
+        """
+        if widths is None and self.smoothing is not None and self.friction.contact is not None:
+            widths = NARROW
         return eqx.tree_at(lambda e: e.smoothing, self, widths, is_leaf=lambda x: x is None)
 
-    def parameters_of(self, theta: ValuesBySymbol, k2: Any, gap: Any) -> CapsuleParameters:
+    def parameters_of(self, theta: ValuesBySymbol, gap: Any) -> CapsuleParameters:
         """Capsule parameters at ``theta``; mu and v_s are placeholders where another friction law replaces them."""
         return CapsuleParameters(
             m1=theta["m1"],
             m2=theta["m2"],
             k1=theta["k1"],
-            k2=k2,
             c=theta["c"],
             mu=theta.get("mu", 0.0),
             v_s=theta.get("v_s", 1.0),
-            G=gap,
             g=theta["g"],
             k_cubic=theta.get("k_cubic", 0.0),
             c2=theta.get("c2", 0.0),
+            **self.friction.support_at(theta, gap),
             **self.ground_at(theta),
         )
 
@@ -152,7 +161,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         gap = stated_gap(table)
         self.gap = gap.value if gap.sd == 0.0 else None
         rows = [parameter("k1"), parameter("c"), *friction.parameters]
-        rows += [] if table.settings.gap is None else [parameter("k2", table.settings.spring)]
+        rows += [] if table.settings.gap is None else friction.support(table.settings.spring)
         rows += stated_parameters("G", gap, table.label)
         rows.append(parameter("x_start", table.label, Prior("normal", 0.0, self.width)))
         rows.append(parameter("y_start", table.label, Prior("normal", 0.0, self.width * self.rough.Omega_o)))
@@ -165,7 +174,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         return Experiment.second_models(records, readings)
 
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
-        p = self.parameters_of(theta, theta.get("k2", 0.0), theta["G"] if self.gap is None else self.gap)
+        p = self.parameters_of(theta, theta["G"] if self.gap is None else self.gap)
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
         times = jnp.multiply.outer(stretch(self.clock_rate, theta), self.time)
         t = self.simulated(theta, p, OFF, times, initial)
@@ -205,5 +214,5 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         v = jnp.asarray(x["speed"])
         still, end = jnp.zeros_like(v), jnp.asarray(self.horizon)
         times = jnp.stack([still, end], axis=1)
-        t = self.simulated(theta, self.parameters_of(theta, 0.0, np.inf), OFF, times, (still, v, still, v))
+        t = self.simulated(theta, self.parameters_of(theta, np.inf), OFF, times, (still, v, still, v))
         return t.X2[:, -1]

@@ -1,6 +1,6 @@
 """Friction law of a fit: its sampled parameters, and the law at given values."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, cast
 
@@ -11,14 +11,15 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.parameters import INSTRUMENT_ERRORS, Name, Parameter, Prior, parameter
+from capsule_id.physics.forces import Force
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force, scaled
 from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 
 # friction model: Friction law of a fit: its sampled parameters, and the law at given values.
 
 
-#: Symbol of the leaf that holds the normal force, N.
-NORMAL_FORCE = "N"
+#: Symbols of the leaves that hold the normal force, N, and the gap of a contact, m.
+NORMAL_FORCE, GAP = "N", "G"
 #: Values of eq. (1) at which the friction is the same at every speed; v_s is then any positive number.
 CONSTANT = {"ratio": 1.0, "v_s": 1.0}
 #: Prior draws at which a parameter may change the break-away force.
@@ -57,62 +58,67 @@ class FrictionModel:
     free : symbols of the optional parameters that are sampled; the others keep their defaults
     constant : eq. (1) with ratio 1: the same friction at every speed, without v_s
     direction : of the sliding that an experiment records. "backward" exchanges the directions of the law
+    contact : class of a force in place of the support spring of runs and decays. Its leaf ``G`` holds the gap, m
 
     Raises
     ------
     InputError
-        If ``law`` is no class of friction laws, if it has a leaf other than N that is not sampled, or a sampled one
-        without a default prior, or if N is sampled.
+        If ``law`` is no class of friction laws, or ``contact`` none of forces with a gap; if one has a leaf other than N or
+        G that is not sampled, or a sampled one without a default prior; or if N or G is sampled.
     """
 
     law: type[FrictionLaw] = CoulombStribeck
     free: tuple[str, ...] = ()
     constant: bool = False
     direction: Literal["both", "forward", "backward"] = "both"
+    contact: type[Force] | None = None
 
     def __post_init__(self) -> None:
-        law, wanted = self.law, ("parameters", "forward", "backward")
+        law, contact, wanted = self.law, self.contact, ("parameters", "forward", "backward")
         if not isinstance(law, type) or not all(hasattr(law, name) for name in wanted):
             raise InputError(
                 "friction must be a class with parameters, forward(speed) and backward(speed)",
                 repr(law),
                 "give the class itself; see capsule_id.physics.friction.FrictionLaw",
             )
-        for row in law.parameters:
-            if row.symbol == NORMAL_FORCE and (row.prior is not None or row.sampled):
-                raise InputError(
-                    f"a leaf N of the friction law {law.__name__} holds the weight, N, and is not sampled",
-                    row.meaning,
-                    "give the row no prior and sampled=False, or rename the leaf",
-                )
-            if row.symbol != NORMAL_FORCE and (row.prior is None or not row.sampled):
-                raise InputError(
-                    f"every parameter of the friction law {law.__name__} must have a default prior",
-                    f"{row.symbol} has none",
-                    f"give Parameter({row.symbol!r}, ...) a prior",
-                )
-        try:
-            leaves = jax.tree.leaves(self._at({row.symbol: _prior_of(row).median for row in self.parameters}, 1.0))
-        except TypeError as error:
+        _check_leaves(f"the friction law {law.__name__}", law, NORMAL_FORCE, "the weight, N", lambda: self._at({}, 1.0))
+        if contact is None:
+            return
+        if not (isinstance(contact, type) and issubclass(contact, Force)) or GAP not in {
+            row.symbol for row in contact.parameters
+        }:
             raise InputError(
-                f"the friction law {law.__name__} must have one row of parameters per field",
-                str(error),
-                "give every field a row with the field's name as its symbol",
-            ) from None
-        if len(leaves) != len(law.parameters) or any(isinstance(leaf, law) for leaf in leaves):
-            raise InputError(
-                f"the friction law {law.__name__} must be a pytree whose leaves are its parameters",
-                f"leaves: {len(leaves)}",
-                "add @jax.tree_util.register_dataclass above @dataclass",
+                "contact must be a class of forces with a row of parameters for its gap G",
+                repr(contact),
+                "give the class itself; see capsule_id.physics.forces.Force",
             )
+        medians = {row.symbol: row.prior.median for row in contact.parameters if row.prior is not None}
+        role = f"the contact {contact.__name__}"
+        _check_leaves(role, contact, GAP, "the gap, m", lambda: cast(Any, contact)(**{**medians, GAP: 1.0}))
+
+    def support(self, spring: str | None) -> list[Parameter]:
+        """The sampled parameters of a support: k2 of the ``spring``, or the leaves of ``contact``; None: no support."""
+        if spring is None:
+            return []
+        rows = () if self.contact is None else self.contact.parameters
+        return [row for row in rows if row.symbol != GAP] or [parameter("k2", spring)]
+
+    def support_at(self, theta: ValuesBySymbol, gap: Any) -> dict[str, Any]:
+        """k2, G and forces of ``CapsuleParameters`` at ``theta``, which has k2 or the leaves of ``contact``, or none."""
+        own = {} if self.contact is None else {row.symbol: theta.get(row.symbol) for row in self.support("")}
+        if self.contact is None or None in own.values():
+            return {"k2": theta.get("k2", 0.0), "G": gap}
+        return {"k2": 0.0, "G": gap, "forces": (cast(Any, self.contact)(**own, **{GAP: gap}),)}
 
     @property
     def name(self) -> str:
         """Name for legends."""
-        if self.law is not CoulombStribeck:
-            return self.law.__name__
-        words = ["constant friction" if self.constant else "eq. (1)", *(f"free {symbol}" for symbol in self.free)]
-        return ", ".join(words)
+        words = [self.law.__name__] if self.law is not CoulombStribeck else []
+        words = words or [
+            "constant friction" if self.constant else "eq. (1)",
+            *(f"free {symbol}" for symbol in self.free),
+        ]
+        return ", ".join(words if self.contact is None else [*words, f"contact {self.contact.__name__}"])
 
     @property
     def is_proportional(self) -> bool:
@@ -156,20 +162,23 @@ class FrictionModel:
     @property
     def source(self) -> str:
         """Name of the law in provenance: module and class; "eq. (1)" for the paper's, with its free parameters."""
-        return self.name if self.law is CoulombStribeck else f"{self.law.__module__}.{self.law.__qualname__}"
+        own = [law for law in (self.law, self.contact) if law not in (CoulombStribeck, None)]
+        return ", ".join(f"{law.__module__}.{law.__qualname__}" for law in own if law is not None) or self.name
 
     def check(self, known: Mapping[str, Parameter]) -> None:
-        """Reject a law that has the symbol of a different parameter in ``known`` (package and kinds).
+        """Reject a law or a contact that has the symbol of a different parameter in ``known`` (package and kinds).
 
         Raises
         ------
         InputError
             At the first such parameter.
         """
-        for row in self.parameters:
-            if known.get(row.symbol, row) != row:
+        rows = [] if self.contact is None else self.support("")
+        for row in (*self.parameters, *rows):
+            if known.get(row.symbol, row) != row or (row in rows and row.symbol in known):
                 raise InputError(
-                    f"a parameter of the friction law {self.law.__name__} must have a symbol of its own",
+                    f"a parameter of {self.contact.__name__ if row in rows and self.contact else self.law.__name__} must "
+                    "have a symbol of its own",
                     f"{row.symbol}: {known[row.symbol].meaning}",
                     "rename it",
                 )
@@ -191,6 +200,38 @@ class FrictionModel:
         constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
         law = cast(Any, self.law)(**known, **constant, **(CONSTANT if self.constant else {}))
         return Reversed(law) if self.direction == "backward" else law
+
+
+def _check_leaves(role: str, law: type, held: str, holds: str, make: Callable[[], Any]) -> None:
+    """Refuse a class whose leaves are not its sampled ``parameters`` and ``held``, which holds a number of the rig."""
+    rows = cast(Any, law).parameters
+    for row in rows:
+        if row.symbol == held and (row.prior is not None or row.sampled):
+            raise InputError(
+                f"a leaf {held} of {role} holds {holds}, and is not sampled",
+                row.meaning,
+                "give the row no prior and sampled=False, or rename the leaf",
+            )
+        if row.symbol != held and (row.prior is None or not row.sampled):
+            raise InputError(
+                f"every parameter of {role} must have a default prior",
+                f"{row.symbol} has none",
+                f"give Parameter({row.symbol!r}, ...) a prior",
+            )
+    try:
+        leaves = jax.tree.leaves(make())
+    except TypeError as error:
+        raise InputError(
+            f"{role} must have one row of parameters per field",
+            str(error),
+            "give every field a row with the field's name as its symbol",
+        ) from None
+    if len(leaves) != len(rows) or any(isinstance(leaf, law) for leaf in leaves):
+        raise InputError(
+            f"{role} must be a pytree whose leaves are its parameters",
+            f"leaves: {len(leaves)}",
+            "add @jax.tree_util.register_dataclass above @dataclass",
+        )
 
 
 def _prior_of(row: Parameter) -> Prior:
@@ -226,8 +267,8 @@ def model_lines(model: FrictionModel) -> str:
 EQUATION_1 = FrictionModel()
 
 
-def friction_of(rig: Rig, law: type[FrictionLaw] | None = None) -> FrictionModel:
-    """Return the friction model of a fit: the class ``law``, by default eq. (1) with the choices of ``[model]``.
+def friction_of(rig: Rig, law: type[FrictionLaw] | None = None, contact: type[Force] | None = None) -> FrictionModel:
+    """Return the laws of a fit: the class ``law``, by default eq. (1) with the choices of ``[model]``, and the ``contact``.
 
     Raises
     ------
@@ -237,7 +278,7 @@ def friction_of(rig: Rig, law: type[FrictionLaw] | None = None) -> FrictionModel
     own = {row.symbol for row in CoulombStribeck.parameters}
     free = tuple(symbol for symbol in rig.model.free if symbol in own)
     if law is None:
-        return FrictionModel(free=free, constant=rig.model.friction == "constant")
+        return FrictionModel(free=free, constant=rig.model.friction == "constant", contact=contact)
     if free or rig.model.friction != ModelChoices().friction:
         raise InputError(
             "a friction law of its own replaces [model]",
@@ -245,7 +286,7 @@ def friction_of(rig: Rig, law: type[FrictionLaw] | None = None) -> FrictionModel
             "remove friction and free from [model]",
             rig.folder / "rig.toml",
         )
-    return FrictionModel(law)
+    return FrictionModel(law, contact=contact)
 
 
 # ground: Slope of the track, and a force that presses the capsule down besides the weight.

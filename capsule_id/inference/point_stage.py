@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -167,7 +167,10 @@ class _Fit:
 
     def with_law(self, law: FrictionModel, seed: int) -> "_Fit":
         """Fit another friction law from this fit alone: the motion is known, and only a comparison needs the result."""
-        experiments = [e.with_friction(law) if isinstance(e, SurfaceExperiment) else e for e in self.target.experiments]
+        experiments = [
+            e.with_friction(replace(law, contact=e.friction.contact)) if isinstance(e, SurfaceExperiment) else e
+            for e in self.target.experiments
+        ]
         target = LogPosterior(self.target.rig, experiments)
         values = {**{name: start.centre for name, start in target.starts().items()}, **self.values}
         start = target.unconstrain(np.array([values[name] for name in target.names]))

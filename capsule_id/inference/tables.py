@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.experiments import paper_estimates
+from capsule_id.experiments.friction_model import SurfaceExperiment
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.checks.posterior import runs_alone
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
@@ -71,7 +72,7 @@ def smoothing_certificate(target: LogPosterior, fit: PointFit) -> ResultTable:
     One Gauss–Newton step maps the difference of the residuals of both engines through the Jacobian of this fit.
     """
     smooth = target.rig.model.engine == "smooth"
-    engines = {"engine": "smoothed", "other": "exact"} if smooth else {"engine": "exact", "other": "smoothed"}
+    engines = {"engine": "smoothed", **_other(target)} if smooth else {"engine": "exact", "other": "smoothed"}
     named = zip(target.located, *smoothing_shift(target, fit, None if smooth else Smoothing()), strict=True)
     rows = {target.names[i]: [d, s, d / s] for i, d, s in named if target.parameters[i].physical}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["shift of u", "sd of u", "shift / sd"])
@@ -84,6 +85,14 @@ def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing | Non
     normal = jacobian.T @ jacobian
     step = -np.linalg.solve(normal, jacobian.T @ (_residuals(_by_engine(target, widths), fit) - own))
     return step, np.sqrt(np.diag(np.linalg.inv(normal)))
+
+
+def _other(target: LogPosterior) -> dict[str, str]:
+    """The model that a fit with the smoothed engine is compared with, and what to do where they differ."""
+    moved = [e for e in target.experiments if isinstance(e, SurfaceExperiment) and e.event_driven]
+    if any(e.friction.contact is not None for e in moved):
+        return {"other": "smoothed (a quarter of the widths)", "remedy": "do not quote them"}
+    return {"other": "exact", "remedy": 'fit with engine = "exact" in [model] of rig.toml'}
 
 
 def _by_engine(target: LogPosterior, widths: Smoothing | None) -> LogPosterior:
@@ -113,8 +122,12 @@ def check_engine(sampled: SampledFit) -> list[Finding]:
     # A shift that is not finite fails.
     names = tuple(name for name, s in shifts.items() if not s <= SMALL_SHIFT)
     level = "ok" if not names else "warn" if all(s <= LARGE_SHIFT for s in shifts.values()) else "fail"
-    facts = {**WIDTHS, "largest": np.max(list(shifts.values())), "names": ", ".join(names), "wanted": SMALL_SHIFT}
-    return [Finding("model.engine", level, facts, parameters=names)]
+    found = {
+        "largest": np.max(list(shifts.values())),
+        "names": ", ".join(names),
+        "wanted": SMALL_SHIFT,
+    }
+    return [Finding("model.engine", level, {**WIDTHS, **_other(target), **found}, parameters=names)]
 
 
 # notes: Tables of the report: those of the experiments and those of the whole fit.

@@ -135,10 +135,10 @@ def _tails(facts: Facts) -> str:
 
 
 _SMOOTHED = (
-    "the smoothed engine (velocity {velocity:g} m/s, penetration {penetration:g} m) integrates the capsule; the exact engine "
+    "the smoothed engine (velocity {velocity:g} m/s, penetration {penetration:g} m) integrates the capsule; the {other} model "
     "would shift no parameter by more than {largest:.2g} sd"
 )
-_BIASED = '. Expected {wanted:g} sd or less, but not of {names}: fit with engine = "exact" in [model] of rig.toml.'
+_BIASED = ". Expected {wanted:g} sd or less, but not of {names}: {remedy}."
 _CHAINS = (
     "{draws} draws of each ensemble are {length:.0f} autocorrelation times of {slowest}, smallest effective sample size "
     "{size:.0f} ({smallest}), largest split R-hat {rhat:.4f} ({worst})"

@@ -1,8 +1,8 @@
-"""A friction law that the package does not know: one class, simulated, fitted through the exact engine, reported."""
+"""A friction law and a contact that the package does not know: one class each, simulated, fitted, reported."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +23,14 @@ from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.drive import Excitation
+from capsule_id.physics.forces import Force, Spring
 from capsule_id.physics.friction import CoulombStribeck
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.physics.simulation import simulate
-from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 from tests.experiments import bench
 from tests.rig.folder import RIG_TOML, write_folder
+from tests.scipy_capsule import simulate_scipy
 
 #: (n,) m/s, and N.
 Speed = Any
@@ -236,7 +238,7 @@ def test_a_kind_that_reads_mu_is_refused_beside_a_law() -> None:
     registry = Registry((*kinds.kinds, own))
     spin = replace(tilts(np.random.default_rng(0)), kind="spin", label="spin")
     own_rig = bench.rig(spin, pushes(np.random.default_rng(1)))
-    with pytest.raises(InputError, match=r"the kind spin reads mu of eq. \(1\), which the friction law Lorentzian"):
+    with pytest.raises(InputError, match=r"the kind spin reads mu, which Lorentzian replaces"):
         make_experiments(own_rig, registry=registry, friction=Lorentzian)
     # Negative control: eq. (1) by default, and by name.
     for law in (None, CoulombStribeck):
@@ -323,3 +325,101 @@ def test_draws_of_another_law_are_not_resumed(tmp_path: Path) -> None:
         assert "kept" in chains._file
     with ChainStore(store, "another") as chains:
         assert "kept" not in chains._file
+
+
+# A contact of one's own in the place of the support spring.
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Hertz(Force):
+    """k_h d^p behind the gap G."""
+
+    k_h: float
+    p: float
+    G: float
+
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("k_h", "N/m^p", "stiffness of the contact", "k_h", Prior("lognormal", 8e5, 10.0)),
+        Parameter("p", "1", "power of the penetration", "p", Prior("lognormal", 1.3, 1.3)),
+        Parameter("G", "m", "gap", "G", sampled=False),
+    )
+
+    @property
+    def gap(self) -> Any:
+        return self.G
+
+    def elastic(self, d: Any) -> Any:
+        return self.k_h * d**self.p
+
+
+CONTACT = {"k_h": 1e6, "p": 1.5}
+
+
+def run_on_contact(rng: np.random.Generator, spring: str = "L60") -> Table:
+    """0.4 s from rest on the support 1e6 N/m^1.5 d^1.5, by SciPy."""
+    time = np.arange(400) / 1000.0
+    q = {"m1": bench.M1, "m2": bench.M2, "k1": bench.K1, "c": bench.C, "g": bench.G, "mu": 0.66, "v_s": 0.3}
+    q |= {"k2": CONTACT["k_h"], "power": CONTACT["p"], "G": GAP, "P_d": P_D, "Omega": OMEGA}
+    states, closings = simulate_scipy(q, time, rtol=1e-9, atol=1e-12, max_step=1e-3)
+    assert closings >= 2
+    seen = {"x_rel": states[:, 0] - states[:, 2], "x_capsule": states[:, 2]}
+    columns = [bench.column(name, values + NOISE * rng.standard_normal(len(time))) for name, values in seen.items()]
+    settings = {"spring": spring, "gap": Quantity(GAP), "Omega": OMEGA, "P_d": Quantity(P_D), "start": "stuck"}
+    return bench.table("forced_run", [bench.column("time", time), *columns], f"run_{spring}", **settings)
+
+
+def on_contact(*tables: Table, engine: Literal["exact", "smooth"] = "smooth") -> Rig:
+    priors = {"k1": Prior("lognormal", bench.K1, 1.02), "c": Prior("lognormal", bench.C, 1.05)}
+    priors |= {"mu": Prior("lognormal", 0.66, 1.02), "v_s": Prior("lognormal", 0.3, 1.1)}
+    return replace(bench.rig(*tables, priors=priors), model=ModelChoices(engine=engine))
+
+
+@pytest.mark.slow
+def test_a_fit_recovers_a_contact_of_ones_own(tmp_path: Path) -> None:
+    """k_h and p of k_h d^p, with the smoothed engine. The negative control: the linear spring fits worse."""
+    rig = on_contact(run_on_contact(np.random.default_rng(3)))
+    fitted = cid.fit(rig, budget=None, contact=Hertz)
+    point = fitted.point_fit
+    assert not [name for name in point.names if name.startswith("k2")]
+    for name, truth in CONTACT.items():
+        assert abs(point.values[name] - truth) < 4.0 * point.standard_errors[name] < truth, name
+    assert [f.level for f in fitted.findings if f.code == "model.engine"] == ["ok"]
+    fitted.write(tmp_path / "out")
+    assert "a quarter of the widths" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert cid.load(tmp_path / "out").provenance.friction == f"{Hertz.__module__}.Hertz"
+    linear = cid.fit(rig, budget=None).point_fit
+    assert point.log_posterior.max() - linear.log_posterior.max() > 30.0
+
+
+def test_the_residuals_of_a_contact_of_ones_own_are_those_of_the_noise() -> None:
+    """With the smoothed engine at the truth; not with another power. The parameters are those of the class, without k2."""
+    rig = on_contact(run_on_contact(np.random.default_rng(3)))
+    (run,) = make_experiments(rig, contact=Hertz)
+    assert {"k_h", "p"} < {row.symbol for row in run.parameters}
+    assert not {"k2", "G"} & {row.symbol for row in run.parameters}
+    truth = {"m1": bench.M1, "m2": bench.M2, "g": bench.G, "k1": bench.K1, "c": bench.C, "mu": 0.66, "v_s": 0.3}
+    truth |= {"phase": 0.0, "x_start": 0.0, **CONTACT}
+    for power, low, high in ((1.5, 0.9, 1.2), (1.4, 2.0, np.inf)):
+        motion = run.motion({**truth, "p": power}, np)  # type: ignore[attr-defined]  # pyright: ignore
+        left = np.asarray(motion.x_rel).ravel() - rig.tables[0]["x_rel"]
+        assert low < np.std(left) / NOISE < high
+
+
+def test_a_contact_that_cannot_be_fitted_is_refused() -> None:
+    rng = np.random.default_rng(3)
+    run = run_on_contact(rng)
+    pressed = [bench.column("deflection", np.array([1e-3, 2e-3])), bench.column("force", np.array([2.0, 4.0]))]
+    spring = bench.table("support_spring", pressed, spring="L60")
+    row = Hertz.parameters[0]
+    taken = type("Taken", (Hertz,), {"parameters": (replace(row, symbol="k2"), *Hertz.parameters[1:])})
+    for rig, contact, words in (
+        (on_contact(run, engine="exact"), Hertz, 'whole powers .* use simulate with model="smooth"'),
+        (on_contact(run, replace(run_on_contact(rng, "soft"))), Hertz, "describes one spring"),
+        (on_contact(run, spring), Hertz, "support_spring reads k2, which .*contact Hertz replaces"),
+        (on_contact(run), Hertz(1e6, 1.5, 1e-3), "contact must be a class of forces"),
+        (on_contact(run), Spring, "a row of parameters for its gap"),
+        (on_contact(run), taken, "one row of parameters per field"),
+    ):
+        with pytest.raises(InputError, match=words):
+            cid.fit(rig, budget=None, contact=contact)  # type: ignore[arg-type]

@@ -217,9 +217,10 @@ class CapsuleRun(CapsuleForward):
         """The parameters of the run with their priors."""
         of, whole, settings, free = self.label, self.about.record, self.table.settings, self.rig.model.free
         rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
-        rows += [parameter(name) for name in ("k_cubic", "c2")[: 1 if self.spring is None else 2] if name in free]
+        damped = self.spring is not None and self.friction.contact is None
+        rows += [parameter(name) for name in ("k_cubic", "c2")[: 1 + damped] if name in free]
         rows += [*clock_parameters(self.table, self.rig), *instrument_parameters(self.table)]
-        rows += [] if self.spring is None else [parameter("k2", self.spring)]
+        rows += self.friction.support(self.spring)
         rows += stated_parameters("G", settings.gap, whole)
         if self.driven_by_current:
             amplitude = 0.5 * float(np.ptp(self.table["current"]))
@@ -364,7 +365,7 @@ class CapsuleRun(CapsuleForward):
 
     def with_spring(self, theta: ValuesBySymbol) -> CapsuleParameters:
         """Parameters at ``theta`` with the support spring of this run; k2 = 0 where there is none."""
-        return self.parameters_of(theta, theta.get("k2", 0.0), theta["G"] if self.gap is None else self.gap)
+        return self.parameters_of(theta, theta["G"] if self.gap is None else self.gap)
 
     def true_time(self, theta: ValuesBySymbol) -> Any:
         """Times of the samples (..., n), s, with the drift of the clock at ``theta``."""

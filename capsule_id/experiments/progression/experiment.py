@@ -284,7 +284,7 @@ class Progression(CapsuleForward):
             "prior": theta.get(AMPLITUDE[self.drive], 0.0) + 0.0 * period,
             "exact": self.force + 0.0 * period,
         }[self.amplitude_from]
-        p = self.parameters_of(theta, 0.0, np.inf)
+        p = self.parameters_of(theta, np.inf)
         if self.drive == "harmonic":
             return p, Excitation(force, 2.0 * np.pi / period, 0.0, self.reaction)
         return p, Pulses(

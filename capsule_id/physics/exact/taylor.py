@@ -134,7 +134,7 @@ def on_series(force: Force, d: Taylor, w: Taylor) -> Taylor:
         raise InputError(
             "the exact engine takes forces made of +, - and * and whole powers (int) of d and w only",
             f"the formulas of {type(force).__name__}",
-            'use simulate with model="smooth"',
+            'use simulate with model="smooth", or engine = "smooth" in [model] for a fit',
         ) from None
     return found if isinstance(found, Taylor) else Taylor(lambda k: found if k == 0 else 0.0, d.unit)
 
