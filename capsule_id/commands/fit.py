@@ -17,7 +17,7 @@ from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.views import counted
 
-DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 1000
+DEFAULT_MAX_STEPS, DEFAULT_ESS = 2500, 1000
 
 
 OPTIONS = {

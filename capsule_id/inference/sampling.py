@@ -244,8 +244,8 @@ MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks: so many, or this part of all.
 FIRST_CHECK, CHECK_EVERY, CHECK_SHARE = 40, 10, 5
 #: Work of all evaluations of the default budget, and of the rounds of an adaptation, at most, in readings: some 20 s
-#: and 5 s on two cores.
-MOST_WORK, PILOT_WORK = 1e9, 2.5e8
+#: and 5 s on two cores; and what an evaluation costs besides its readings: few readings take 0.1 ms too.
+MOST_WORK, PILOT_WORK, FIXED_WORK = 1e9, 2.5e8, 2500
 #: Parameters of the smallest large block among those with a motion of the capsule: a forced run correlates all its
 #: parameters and determines them well, so that the Laplace approximation is tried as it is.
 LARGE = 9
@@ -261,7 +261,7 @@ CORES = min(ENSEMBLES, os.cpu_count() or 1)
 #: Time after which ensembles wait for each other, s.
 ROUND = 1.0
 #: Largest number of emcee steps of an ensemble after burn-in, unless stated.
-DEFAULT_BUDGET = 20_000
+DEFAULT_BUDGET = 2500
 #: Stored draws per autocorrelation time of the pilot, and the largest number of steps per stored draw. The limit is
 #: needed because a short pilot estimates the autocorrelation time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
@@ -324,7 +324,7 @@ def sample(
             samplers = list(threads.map(lambda *one: _sampler(target, schedule, *one), seeds, backends))
         draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
         walkers = ENSEMBLES * len(samplers[0].state.coords)
-        share = min(1.0, MOST_WORK / (DEFAULT_BUDGET * walkers * target.work))
+        share = min(1.0, MOST_WORK / (DEFAULT_BUDGET * walkers * (target.work + FIXED_WORK)))
         last = max(int(budget * share) // schedule.thin, 2)
         for goal in _checks(min(sampler.stored for sampler in samplers), last):
             for done in _advance(samplers, goal, schedule.thin):

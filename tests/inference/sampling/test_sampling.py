@@ -12,7 +12,7 @@ from capsule_id.inference.marginal import uniform_at
 from capsule_id.inference.moves import effective_sample_size, ensemble_time
 from capsule_id.inference.proposal import affordable_rounds
 from capsule_id.inference.result import Posterior
-from capsule_id.inference.sampling import DEFAULT_ESS, ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
+from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS, ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
 from tests.inference.stub import Gaussian
 
 #: Largest |z| of the 16 numbers tested at once: false alarm in 1 of 1000.
@@ -224,3 +224,12 @@ def test_no_private_attribute_of_emcee_is_used() -> None:
 def test_the_pilot_is_bounded_by_the_work_of_an_evaluation() -> None:
     """Rounds of adaptation are added only where that is affordable."""
     assert [affordable_rounds(number) for number in (1.0, 10 * 2048.0, 1e9)] == [6, 10, 16]
+
+
+def test_a_slow_density_gets_fewer_steps() -> None:
+    """Default steps of a density of few readings end within 3e5 evaluations; of one with 30,000 readings in a tenth."""
+    plain, slow = Gaussian(KNOWN.mean, KNOWN.sigma), Gaussian(KNOWN.mean, KNOWN.sigma)
+    slow.work = 30_000
+    steps = [sample(target, 1, 200, ess=1e9).draws.shape[1] for target in (plain, slow)]
+    assert DEFAULT_BUDGET * ENSEMBLES * 32 <= 320_000
+    assert steps[1] / steps[0] == pytest.approx(1e9 / (320_000 * 32_500), rel=0.2)
