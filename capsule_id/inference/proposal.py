@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations, product
 
 import numpy as np
@@ -276,6 +277,8 @@ SHRINKAGE = 30.0
 OUTER, KNOTS, FAR = 2.5, 11, 2.0
 #: Scores of this effective number of draws or fewer are linear; of more draws, in proportion less.
 SMOOTHED = 50.0
+#: Indices of the products of two coordinates; a chain asks for those of a few dimensions at each of its steps.
+PAIRS = cache(np.triu_indices)
 #: Newton steps for the scales, and the share of each step that is taken.
 MAP_STEPS, SHARE = 30, 0.7
 
@@ -329,9 +332,9 @@ class Transported:
         z, ridge = self._z(s), SHRINKAGE * np.sum(weights**2)
         d = z.shape[1]
         # Columns: 1, the coordinates and their products, of which a coordinate uses those before it.
-        self._means, self._scales = np.zeros((1 + d + len(np.triu_indices(d)[0]), d)), np.zeros((1 + d, d))
+        self._means, self._scales = np.zeros((1 + d + len(PAIRS(d)[0]), d)), np.zeros((1 + d, d))
         self._own = [
-            np.flatnonzero(np.concatenate([[True], np.arange(d) < i, np.triu_indices(d)[1] < i])) for i in range(d)
+            np.flatnonzero(np.concatenate([[True], np.arange(d) < i, PAIRS(d)[1] < i])) for i in range(d)
         ]
         quadratic, linear = _quadratic(z), _linear(z)
         for i, own in enumerate(self._own):
@@ -381,7 +384,7 @@ def _linear(z: Float[np.ndarray, "n i"]) -> Float[np.ndarray, "n k"]:
 
 def _quadratic(z: Float[np.ndarray, "n i"]) -> Float[np.ndarray, "n k"]:
     """1, the coordinates and their products of two."""
-    first, second = np.triu_indices(z.shape[1])
+    first, second = PAIRS(z.shape[1])
     near = _linear(z)
     return np.column_stack([near, near[:, 1 + first] * near[:, 1 + second]])
 
