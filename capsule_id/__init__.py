@@ -60,11 +60,11 @@ if TYPE_CHECKING:
         draws_diagram as draws_diagram,
         motion_map as motion_map,
     )
-    from capsule_id.physics.drive import Excitation as Excitation
     from capsule_id.physics.drives import Pulses as Pulses, RecordedDrive as RecordedDrive, RodMotion as RodMotion
     from capsule_id.physics.energy import energy_balance as energy_balance
     from capsule_id.physics.model import (
         CapsuleParameters as CapsuleParameters,
+        Excitation as Excitation,
         Status as Status,
         Trajectory as Trajectory,
         status_message as status_message,
@@ -85,10 +85,9 @@ _PUBLIC = {
     "inference.compare": ("compare_models", "compare_points"),
     "motions.response": ("Response", "Settling", "response"),
     "motions.sweep": ("continuation", "diagram", "draws_diagram", "motion_map"),
-    "physics.drive": ("Excitation",),
     "physics.drives": ("Pulses", "RecordedDrive", "RodMotion"),
     "physics.energy": ("energy_balance",),
-    "physics.model": ("CapsuleParameters", "Status", "Trajectory", "status_message"),
+    "physics.model": ("CapsuleParameters", "Excitation", "Status", "Trajectory", "status_message"),
     "physics.simulation": ("simulate", "smoothing_bias"),
     "physics.smooth.engine": ("Smoothing",),
     "synthetic": ("RobotDesign", "synthesize", "synthesize_robot"),

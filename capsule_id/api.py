@@ -17,9 +17,8 @@ from scipy import stats
 
 from capsule_id.console import OnProgress, Progress
 from capsule_id.errors import InputError
-from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.friction_model import friction_of
-from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.experiments.kind import Choice, Registry, default_registry, make_experiments
 from capsule_id.inference.pipeline import (
     check_fit,
     check_readings,
@@ -37,10 +36,9 @@ from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.parameters import by_index, is_stated
-from capsule_id.physics.drive import Drive
 from capsule_id.physics.forces import Force, warn_of_far_gap
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.model import CapsuleParameters, Drive, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.precision import prepare_xla
 from capsule_id.report.columns import (

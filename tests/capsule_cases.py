@@ -8,8 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 from capsule_id.precision import COMPILE_QUICKLY
 
 PARAMETERS = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")

@@ -9,8 +9,7 @@ from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.twin import RUNS, STEP, SyntheticRun, make_runs
 from capsule_id.experiments.forced_run.twin import SAMPLES as RECORDED
 from capsule_id.experiments.kind import default_registry
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.synthetic import Truth

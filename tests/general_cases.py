@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from capsule_id.physics.drive import Excitation
 from capsule_id.physics.drives import Pulses, RecordedDrive
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 
 CAPSULE = (
     "m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g",

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.experiments import rough_values
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, rough_values
 from capsule_id.experiments.lint import lint, lint_settings
 from capsule_id.report.messages import finding_text, messages_of
 from tests.remedies_list import Folder

@@ -9,11 +9,9 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.twin import NOISE_SD, RUNS
-from capsule_id.experiments.kind import default_registry
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.experiments.kind import default_registry, make_experiments
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Table
 from capsule_id.synthetic import Truth, synthesize

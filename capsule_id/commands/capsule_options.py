@@ -13,9 +13,8 @@ from capsule_id.errors import InputError
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, by_index
 
 if TYPE_CHECKING:
-    from capsule_id.physics.drive import Excitation
     from capsule_id.physics.drives import Pulses
-    from capsule_id.physics.model import CapsuleParameters
+    from capsule_id.physics.model import CapsuleParameters, Excitation
 
 Value = TypeVar("Value")
 #: Name of the default friction law in the provenance of a result.
@@ -92,9 +91,8 @@ def capsule_values(
 
 def capsule_and_drive(values: Mapping[str, Any], drive: str) -> "tuple[CapsuleParameters, Excitation | Pulses]":
     """The model's parameters and the drive of that name, from values by symbol, SI."""
-    from capsule_id.physics.drive import Excitation
     from capsule_id.physics.drives import Pulses
-    from capsule_id.physics.model import CapsuleParameters
+    from capsule_id.physics.model import CapsuleParameters, Excitation
 
     p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES if name in values})
     own = {name: values[name] for name in DRIVES[drive]}

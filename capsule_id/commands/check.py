@@ -7,8 +7,7 @@ from pathlib import Path
 from capsule_id.commands import PATH
 from capsule_id.console import say
 from capsule_id.errors import InputError, refusing
-from capsule_id.experiments import rough_values
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, rough_values
 from capsule_id.experiments.lint import lint, lint_settings
 from capsule_id.output import write_file
 from capsule_id.report.messages import finding_text, messages_of

@@ -11,8 +11,7 @@ from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.rigs import Options, fit_many, fit_one
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError, check_seed
-from capsule_id.experiments import CHOICES
-from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.experiments.kind import CHOICES, Registry, default_registry
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.views import counted

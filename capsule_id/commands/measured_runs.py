@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from capsule_id.experiments import rough_values
 from capsule_id.experiments.forced_run.declaration import RunSettings
+from capsule_id.experiments.kind import rough_values
 from capsule_id.parameters import SWEPT
 from capsule_id.records.motion import measured_motion
 from capsule_id.records.tones import recorded_drive, stated_gap, stated_Omega

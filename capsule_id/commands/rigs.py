@@ -12,8 +12,7 @@ from capsule_id.commands.bifurcate import client_of
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import OnProgress, Progress, complain, one_line, save_traceback, saved, say, stop_if_interrupted
 from capsule_id.errors import InputError
-from capsule_id.experiments import Choice, make_experiments
-from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.experiments.kind import Choice, Registry, default_registry, make_experiments
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress, write_file
 from capsule_id.rig.model import Rig
 from capsule_id.views import counted

@@ -28,8 +28,7 @@ from capsule_id.experiments.friction_model import (
 )
 from capsule_id.experiments.point_test import PointTest
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.physics.drive import Drive, Excitation
-from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.records.tones import stated_gap

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from capsule_id.experiments.checks import LEVEL
+from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI

@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from capsule_id.experiments.base import Start, ValuesBySymbol, scatter_prior
-from capsule_id.experiments.checks import LEVEL, refit
+from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, refit, scatter_prior
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.kind import Values

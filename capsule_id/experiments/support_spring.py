@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from scipy import stats
 
-from capsule_id.experiments.checks import LEVEL, refit
+from capsule_id.experiments.base import LEVEL, refit
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.line import MESSAGES as LINE_MESSAGES

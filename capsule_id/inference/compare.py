@@ -9,8 +9,7 @@ import pandas as pd
 
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.experiments.kind import Registry, default_registry, make_experiments
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.marginal import trials_of

@@ -27,9 +27,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from capsule_id.console import OnProgress, stop_if_interrupted
-from capsule_id.experiments import Choice, compare, select_tables
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.kind import Registry
+from capsule_id.experiments.kind import Choice, Registry, compare, select_tables
 from capsule_id.experiments.lint import lint
 from capsule_id.inference.checks.posterior import check_agreement, decisive_readings
 from capsule_id.inference.checks.verdict import beside_stated, record_widenings, run_checks, widenings, with_scaled

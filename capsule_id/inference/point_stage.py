@@ -11,12 +11,10 @@ from scipy.optimize import minimize
 
 from capsule_id.console import threads
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments, paper_estimates, select_tables
-from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.checks import Whiteness, correlated_records
+from capsule_id.experiments.base import Experiment, Whiteness, correlated_records
 from capsule_id.experiments.context import Tension
 from capsule_id.experiments.friction_model import FrictionModel, SurfaceExperiment, model_lines
-from capsule_id.experiments.kind import Registry
+from capsule_id.experiments.kind import Registry, make_experiments, paper_estimates, select_tables
 from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.point_fit import point_fit

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy import stats
 
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.curvature import PerPoint, Random
 from capsule_id.inference.marginal import MarginalPosterior, trials_of

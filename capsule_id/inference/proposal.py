@@ -333,9 +333,7 @@ class Transported:
         d = z.shape[1]
         # Columns: 1, the coordinates and their products, of which a coordinate uses those before it.
         self._means, self._scales = np.zeros((1 + d + len(PAIRS(d)[0]), d)), np.zeros((1 + d, d))
-        self._own = [
-            np.flatnonzero(np.concatenate([[True], np.arange(d) < i, PAIRS(d)[1] < i])) for i in range(d)
-        ]
+        self._own = [np.flatnonzero(np.concatenate([[True], np.arange(d) < i, PAIRS(d)[1] < i])) for i in range(d)]
         quadratic, linear = _quadratic(z), _linear(z)
         for i, own in enumerate(self._own):
             f, h = quadratic[:, own], linear[:, : 1 + i]

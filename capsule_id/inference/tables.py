@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments import paper_estimates
 from capsule_id.experiments.friction_model import SurfaceExperiment
-from capsule_id.experiments.kind import Registry
+from capsule_id.experiments.kind import Registry, paper_estimates
 from capsule_id.inference.checks.posterior import runs_alone
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
 from capsule_id.inference.curvature import covariance

@@ -11,11 +11,19 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.physics.batches import CHUNK, is_traced, lanes_of, run_lanes
-from capsule_id.physics.drive import Drive, Excitation, PeriodicDrive
 from capsule_id.physics.exact.engine import RunState, initial_lanes, kernel, run, take_step
 from capsule_id.physics.exact.taylor import CapsuleState, StepSeries, constants_of, touching
 from capsule_id.physics.friction import FrictionLaw, friction_law, horner
-from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Status, without_absent
+from capsule_id.physics.model import (
+    MAX_STEPS,
+    CapsuleParameters,
+    Drive,
+    Excitation,
+    Initial,
+    PeriodicDrive,
+    Status,
+    without_absent,
+)
 
 # Initial state at rest at the origin.
 REST: Initial = (0.0, 0.0, 0.0, 0.0)

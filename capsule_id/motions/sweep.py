@@ -31,8 +31,7 @@ from capsule_id.motions.response import (
 from capsule_id.output import replace_file
 from capsule_id.parameters import CAPSULE_LEAVES, LEAVES, SWEPT
 from capsule_id.physics.batches import CHUNK, lanes_of
-from capsule_id.physics.drive import Excitation, PeriodicDrive
-from capsule_id.physics.model import CapsuleParameters, Initial, without_absent
+from capsule_id.physics.model import CapsuleParameters, Excitation, Initial, PeriodicDrive, without_absent
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -13,9 +13,8 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from capsule_id.physics.batches import CHUNK, folded
-from capsule_id.physics.drive import Drive
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Status, without_absent
+from capsule_id.physics.model import CapsuleParameters, Drive, Status, without_absent
 from capsule_id.physics.simulation import simulate
 
 #: Periods of a block: short, because the motion is compared with its repetition only at the end of a block.

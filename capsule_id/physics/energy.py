@@ -13,12 +13,11 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.physics.batches import lanes_of
-from capsule_id.physics.drive import Drive
 from capsule_id.physics.exact.engine import initial_lanes, march, values_of
 from capsule_id.physics.exact.taylor import constants_of
 from capsule_id.physics.forces import downhill, forces_of
 from capsule_id.physics.friction import FrictionLaw, friction_law, sliding_friction
-from capsule_id.physics.model import CapsuleParameters, Initial, Status, without_absent
+from capsule_id.physics.model import CapsuleParameters, Drive, Initial, Status, without_absent
 
 # Quadrature nodes per step: exact for the square of a velocity polynomial of degree 12.
 NODES = 16

@@ -11,7 +11,7 @@ import numpy as np
 
 from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module
-from capsule_id.physics.drive import Drive
+from capsule_id.physics.model import Drive
 
 # grazing: Where contacts begin: the load at which a rod on a capsule at rest just reaches the support spring.
 

@@ -8,11 +8,19 @@ from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
 from capsule_id.physics.batches import is_traced, lanes_of, run_lanes
-from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.exact import engine as exact
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law
-from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Trajectory, pressed, without_absent
+from capsule_id.physics.model import (
+    MAX_STEPS,
+    CapsuleParameters,
+    Drive,
+    Excitation,
+    Initial,
+    Trajectory,
+    pressed,
+    without_absent,
+)
 from capsule_id.physics.smooth import engine as smooth
 from capsule_id.physics.smooth.engine import Smoothing
 

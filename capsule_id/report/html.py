@@ -17,8 +17,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.experiments import select_tables
 from capsule_id.experiments.context import RunRecord
+from capsule_id.experiments.kind import select_tables
 from capsule_id.inference.result import STATED, Result
 from capsule_id.parameters import Name, is_stated, symbol_of
 from capsule_id.records.motion import UNDECIDED

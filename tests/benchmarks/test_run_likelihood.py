@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.target import LogPosterior
 from tests.cli_tools import DATA

@@ -7,8 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
 

@@ -15,8 +15,7 @@ import pytest
 
 from capsule_id.motions.response import DROPPED, OBSERVED, STANDING
 from capsule_id.motions.sweep import diagram
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from tests.scipy_capsule import simulate_scipy
 
 pytestmark = pytest.mark.benchmark

@@ -17,8 +17,7 @@ from capsule_id.commands import bifurcate as command
 from capsule_id.console import Progress
 from capsule_id.motions import sweep
 from capsule_id.motions.response import Settling, response
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.report.figures.sweeps import MeasuredPoint
 from tests.cli_tools import ROOT, listing, small_rig
 

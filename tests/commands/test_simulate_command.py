@@ -14,8 +14,7 @@ from capsule_id.commands import add_options
 from capsule_id.commands import capsule_options as options
 from capsule_id.commands import simulate as command
 from capsule_id.errors import InputError
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 
 DRIVE = ["--k2", "18960", "--G", "1e-3", "--P_d", "4", "--Omega", "34.56"]

@@ -4,11 +4,11 @@ import bench
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments, paper_estimates
-from capsule_id.experiments.checks import refit
+from capsule_id.experiments.base import refit
 from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction import unit_law
+from capsule_id.experiments.kind import make_experiments, paper_estimates
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.friction import slide_distance

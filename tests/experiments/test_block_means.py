@@ -9,8 +9,7 @@ import pytest
 
 import capsule_id
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks import refit
+from capsule_id.experiments.base import refit
 from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
@@ -25,6 +24,7 @@ from capsule_id.experiments.free_vibration.readings import (
 )
 from capsule_id.experiments.free_vibration.record import ReadingTimes, averaged_process, whiten_by_shape
 from capsule_id.experiments.free_vibration.second_fit import Screening
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.records import release
 from tests.capsule_cases import jit_quickly
 from tests.experiments import bench

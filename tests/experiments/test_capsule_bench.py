@@ -9,13 +9,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.capsule_experiment import CapsuleDecay, CapsuleForward, CapsulePushes
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_free_decay
 from capsule_id.experiments.friction import unit_law
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.point_stage import SampledFit, fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior

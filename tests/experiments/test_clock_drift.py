@@ -6,9 +6,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior

@@ -10,11 +10,10 @@ import pytest
 from scipy.signal import lfilter
 
 from capsule_id.api import fit
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks import LEVEL
+from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.forced_run.drives import FEWEST_PERIODS, BaseRun, repetition
 from capsule_id.experiments.friction_model import FrictionModel
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference import point_stage as second_fits
 from capsule_id.inference.point_stage import error_of_sum, fit_points, law_of_runs
 from capsule_id.inference.result import PointFit

@@ -10,8 +10,7 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import capsule_id as cid
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks import refit
+from capsule_id.experiments.base import refit
 from capsule_id.experiments.free_vibration.experiment import (
     FreeVibration,
     check_drift,
@@ -24,7 +23,7 @@ from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.experiments.free_vibration.readings import CHANNELS, DecayModel
 from capsule_id.experiments.free_vibration.record import Screened
 from capsule_id.experiments.free_vibration.second_fit import Screening, second_models
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.views import Finding
 from tests.experiments import bench

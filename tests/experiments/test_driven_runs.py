@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.experiment import CapsuleRun, growth
-from capsule_id.physics.drive import Drive
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.physics.drives import Pulses, RecordedDrive
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Drive
 from capsule_id.physics.simulation import simulate
 from tests.rig.faults import fault_of
 

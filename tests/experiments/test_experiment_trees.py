@@ -13,11 +13,11 @@ import pandas as pd
 import pytest
 
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.marginal import conditional, density_of

@@ -6,14 +6,12 @@ import bench
 import numpy as np
 import pytest
 
-from capsule_id.experiments import rough_values
 from capsule_id.experiments.forced_run.declaration import MESSAGES
 from capsule_id.experiments.forced_run.drives import contact_time, feasibility, held_rod
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, rough_values
 from capsule_id.parameters import Prior
-from capsule_id.physics.drive import Excitation
 from capsule_id.physics.forces import grazing_load
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Finding

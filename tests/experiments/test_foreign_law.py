@@ -13,19 +13,17 @@ from scipy.integrate import quad
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
-from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.experiments.kind import Registry, default_registry, make_experiments
 from capsule_id.experiments.static_friction import StaticFriction
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.moves import ChainStore
 from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
-from capsule_id.physics.drive import Excitation
 from capsule_id.physics.forces import Force, Spring
 from capsule_id.physics.friction import CoulombStribeck
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 from tests.experiments import bench

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.experiments.checks import autocorrelation, ljung_box
+from capsule_id.experiments.base import autocorrelation, ljung_box
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.models import fold
 from capsule_id.inference.point_fit import point_fit

@@ -12,9 +12,9 @@ import capsule_id as cid
 from capsule_id import cli
 from capsule_id.api import Fit
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.friction import FrictionExperiment
 from capsule_id.experiments.friction_variants import candidates
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.checks.settings import trend
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, named_line, quantity

@@ -8,7 +8,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.physics.friction import CoulombStribeck
 from tests.measured.folders import Entry, make_rig, named_line, quantity
 

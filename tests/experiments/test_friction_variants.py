@@ -8,11 +8,12 @@ import pytest
 from scipy import stats
 
 import capsule_id as cid
-from capsule_id.experiments import friction_variants, make_experiments
-from capsule_id.experiments.checks import LEVEL
+from capsule_id.experiments import friction_variants
+from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.friction import FrictionExperiment, paper_friction_fit
 from capsule_id.experiments.friction_model import FrictionModel, model_lines
 from capsule_id.experiments.friction_variants import VariantPoints, check_variants, fit_variant, order_p
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.physics.friction import CoulombStribeck
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding

@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.special import logsumexp
 
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.progression import experiment
 from capsule_id.experiments.progression.declaration import MOST_TRIALS, OUTLIER_SHARE, TIMES, alternatives
 from capsule_id.experiments.progression.density import MIDDLE, NODES, Sessions, TrialGroups, TrialMisfit

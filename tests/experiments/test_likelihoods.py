@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from capsule_id.experiments import base, make_experiments
+from capsule_id.experiments import base
 from capsule_id.experiments.base import BLOCKS, MOST_TERMS, Experiment, ValuesBySymbol
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.rig.model import Table
 from tests.scipy_decay import scipy_decay
 

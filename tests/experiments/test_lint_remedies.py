@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 import capsule_id as cid
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import decay as rubbed
 from capsule_id.experiments.friction_model import FrictionModel, other_laws
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.lint import lint
 from capsule_id.parameters import TABLE, Parameter, Prior
 from capsule_id.report.messages import finding_text, messages_of

@@ -10,8 +10,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.parameters import Prior, parameter
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.model import Rig

@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.progression.declaration import KIND
 from capsule_id.experiments.progression.density import INNER, NODES
 from capsule_id.experiments.progression.experiment import Progression, check_discrepancy

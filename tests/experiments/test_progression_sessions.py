@@ -15,8 +15,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.stats import multivariate_normal, norm
 
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.progression.density import (
     INNER,
     MIDDLE,

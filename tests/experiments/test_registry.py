@@ -12,8 +12,18 @@ import pytest
 
 from capsule_id.api import fit, read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments import CHOICES, make_experiments, select_tables
-from capsule_id.experiments.kind import BUILT_IN, Kind, Registry, Twin, TwinTable, Values, default_registry
+from capsule_id.experiments.kind import (
+    BUILT_IN,
+    CHOICES,
+    Kind,
+    Registry,
+    Twin,
+    TwinTable,
+    Values,
+    default_registry,
+    make_experiments,
+    select_tables,
+)
 from capsule_id.parameters import TABLE, Name, by_index, scatter
 from capsule_id.report.messages import DATA_MESSAGES, FIT_MESSAGES, messages_of
 from capsule_id.rig.model import Settings

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.experiment import better_start
 from capsule_id.experiments.forced_run.start_state import parts_of
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Table

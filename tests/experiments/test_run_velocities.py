@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import capsule_id as cid
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.drives import ForcedRun, predicted_motion
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.records.motion import measured_motion
 from capsule_id.synthetic import truth_beside
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.rig.model import Table
 
 

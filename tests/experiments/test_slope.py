@@ -9,15 +9,14 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import root_scalar
 
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.capsule_experiment import CapsuleDecay
 from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.physics.drive import Excitation
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import equilibrium
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Table
 from tests.capsule_cases import jit_quickly

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks import refit
+from capsule_id.experiments.base import refit
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior

@@ -11,9 +11,8 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.turning_points import TurningPoints, fitted, screened
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.report.messages import finding_text, messages_of

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import capsule_id as cid
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.lint import lint
 from capsule_id.inference.checks.verdict import with_scaled
 from capsule_id.parameters import Prior

@@ -9,9 +9,9 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks import refit
+from capsule_id.experiments.base import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_zero
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.scipy_decay import scipy_decay

@@ -10,8 +10,7 @@ import pandas as pd
 
 import capsule_id as cid
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.checks.posterior import check_agreement
 from capsule_id.inference.point_stage import SampledFit, fit_points
 from capsule_id.inference.result import Posterior

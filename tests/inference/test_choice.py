@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference import prediction as leave_out
 from capsule_id.inference.compare import variants_of

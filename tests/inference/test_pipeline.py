@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 
 import capsule_id as cid
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.pipeline import (
     check_fit,
     check_readings,

@@ -15,11 +15,11 @@ from scipy.signal import find_peaks
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_drift, check_zero
 from capsule_id.experiments.free_vibration.hidden_terms import check_hidden_terms
 from capsule_id.experiments.free_vibration.record import DecayRecord, Screened
 from capsule_id.experiments.free_vibration.second_fit import second_models
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.result import Posterior
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity

@@ -13,8 +13,7 @@ from capsule_id.errors import InputError
 from capsule_id.motions import sweep as blocks
 from capsule_id.motions.response import Settling
 from capsule_id.motions.sweep import motion_map, sweep_points
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 
 P = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
 E = Excitation(4.0, 34.56)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from capsule_id.motions.response import response
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 
 RIG = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.66, "v_s": 0.3}
 MM = 1e3

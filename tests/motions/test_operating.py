@@ -7,8 +7,7 @@ import xarray as xr
 from capsule_id.errors import InputError
 from capsule_id.motions.response import Settling, response
 from capsule_id.motions.sweep import bands, draws_diagram
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 
 QUICK = Settling(dropped=60, observed=12, exponent_periods=0)
 

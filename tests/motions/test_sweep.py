@@ -20,9 +20,8 @@ from capsule_id.motions.sweep import (
     swept_leaf,
 )
 from capsule_id.parameters import CAPSULE_LEAVES, SWEPT
-from capsule_id.physics.drive import Excitation
 from capsule_id.physics.drives import Pulses
-from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 
 P = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
 E = Excitation(4.0, 34.56)

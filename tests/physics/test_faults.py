@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Status, status_message
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status, status_message
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import states_of
 

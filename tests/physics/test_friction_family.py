@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.physics.drive import Excitation
 from capsule_id.physics.friction import CoulombStribeck, friction_law, slide_distance
-from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import assert_both_ways_as_scipy, jit_quickly, states_of
 from tests.scipy_capsule import simulate_scipy

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.physics.drive import Excitation
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
-from capsule_id.physics.model import CapsuleParameters, Status
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import jit_quickly
 

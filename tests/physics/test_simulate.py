@@ -10,8 +10,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.errors import InputError
 from capsule_id.physics import batches
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases, jit_quickly, states_of
 

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters, Status, Trajectory
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from tests.capsule_cases import Cases, jit_quickly

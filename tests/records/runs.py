@@ -8,8 +8,7 @@ import numpy as np
 
 from capsule_id.experiments.forced_run.declaration import RunSettings
 from capsule_id.experiments.forced_run.twin import GAP_SD, NOISE_SD, RunSetup, SyntheticRun, make_runs
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.records.motion import MeasuredMotion, measured_motion
 from capsule_id.rig.model import Column, Quantity, Table

@@ -8,8 +8,7 @@ import pytest
 
 from capsule_id.experiments.forced_run.twin import GAP_SD, SAMPLES
 from capsule_id.motions.response import response
-from capsule_id.physics.drive import Excitation
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.records.motion import UNDECIDED, Contacts, MeanVelocity, measured_motion
 from capsule_id.records.periods import Repeat, find_period
 from capsule_id.records.tones import Harmonic

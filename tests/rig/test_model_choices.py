@@ -6,7 +6,7 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.parameters import TABLE
 from capsule_id.rig.model import ModelChoices
 from capsule_id.rig.schema import OPTIONAL

@@ -13,19 +13,17 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Start, ValuesBySymbol, axis_label, band, stretch
+from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, autocorrelation, axis_label, band, stretch
 from capsule_id.experiments.capsule_experiment import lag_of
-from capsule_id.experiments.checks import LEVEL, autocorrelation
 from capsule_id.experiments.context import Fitted, RunRecord
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
 from capsule_id.experiments.kind import Estimate
-from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
 from capsule_id.physics.forces import downhill, grazing_load, rod_acceleration, rod_on_capsule
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Status, Trajectory, without_absent
+from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Status, Trajectory, without_absent
 from capsule_id.records.motion import fit_mean_velocity, measured_motion
 from capsule_id.records.tones import relative_position, stated_gap, stated_Omega, tone_at
 from capsule_id.records.view import view_record

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, stated_rate, stretch
+from capsule_id.experiments.base import Start, ValuesBySymbol, autocorrelation, clock_parameters, stated_rate, stretch
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters, stated_starts
-from capsule_id.experiments.checks import autocorrelation
 from capsule_id.experiments.forced_run.declaration import (
     CAPSULE_START,
     CORRELATION,
@@ -35,10 +34,9 @@ from capsule_id.experiments.friction_model import (
 )
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.forces import equilibrium, rod_acceleration
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory
 from capsule_id.records.tones import stated_gap, stated_Omega
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Facts, Finding

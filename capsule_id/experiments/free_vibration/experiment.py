@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import Start, ValuesBySymbol
-from capsule_id.experiments.checks import LEVEL, refit
+from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, refit
 from capsule_id.experiments.context import Check, Fitted
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (

@@ -17,6 +17,7 @@ from tinygp.solvers.quasisep.core import DiagQSM, StrictLowerTriQSM, SymmQSM
 from capsule_id.experiments.base import (
     About,
     ValuesBySymbol,
+    autocorrelation,
     axis_label,
     band,
     clock_parameters,
@@ -24,7 +25,6 @@ from capsule_id.experiments.base import (
     stated_rate,
     stretch,
 )
-from capsule_id.experiments.checks import autocorrelation
 from capsule_id.experiments.free_vibration.declaration import (
     AMPLITUDE,
     DRIFT_RATIO,

@@ -12,8 +12,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.experiments.base import Start
-from capsule_id.experiments.checks import LEVEL, ljung_box, refit
+from capsule_id.experiments.base import LEVEL, Start, ljung_box, refit
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, equilibrium, viscous_fit
 from capsule_id.experiments.free_vibration.hidden_terms import force_responses, further_columns
 from capsule_id.experiments.free_vibration.models import (

@@ -11,8 +11,7 @@ from scipy import stats
 from scipy.fft import dct
 from scipy.ndimage import gaussian_filter1d
 
-from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.checks import LEVEL
+from capsule_id.experiments.base import LEVEL, Experiment
 from capsule_id.experiments.lint import WRONG_PREFIX
 from capsule_id.inference.checks.settings import SMALLEST_SCATTER, basis_of, design
 from capsule_id.inference.least_squares import linearised

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.experiments.checks import autocorrelation, estimate, refit
+from capsule_id.experiments.base import Experiment, ValuesBySymbol, autocorrelation, estimate, refit
 from capsule_id.experiments.friction import varies
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.point_fit import residual_jacobian

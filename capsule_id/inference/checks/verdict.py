@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 from scipy import stats
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.checks import LAGS, LEVEL, correlated_records, estimate, refit
+from capsule_id.experiments.base import LAGS, LEVEL, Experiment, correlated_records, estimate, refit
 from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.inference.checks.posterior import (
     PRIOR_PULL,

@@ -13,7 +13,6 @@ from jax.lax import stop_gradient
 from jaxtyping import Bool, Float, Int
 
 from capsule_id.physics.batches import folded, is_traced
-from capsule_id.physics.drive import Drive
 from capsule_id.physics.exact.taylor import (
     GAP,
     LOWER,
@@ -39,7 +38,7 @@ from capsule_id.physics.exact.taylor import (
 )
 from capsule_id.physics.forces import Force
 from capsule_id.physics.friction import DEGREE, FrictionLaw, Scaled, horner, mean, sliding_friction
-from capsule_id.physics.model import CapsuleParameters, Initial, Status, Trajectory, admissible
+from capsule_id.physics.model import CapsuleParameters, Drive, Initial, Status, Trajectory, admissible
 
 # one function: A program that XLA compiles as one function on a CPU.
 

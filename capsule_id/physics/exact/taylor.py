@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax.experimental.jet import jet
 
 from capsule_id.errors import InputError
-from capsule_id.physics.drive import Drive
 from capsule_id.physics.forces import Force, along_ground, forces_of, total, weights_along
 from capsule_id.physics.friction import (
     DEGREE,
@@ -21,7 +20,7 @@ from capsule_id.physics.friction import (
     mean,
     sliding_friction,
 )
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, Drive
 
 # friction series: Taylor coefficients of friction along a step, for a law that is known only as functions of speed.
 #

@@ -9,7 +9,6 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from capsule_id.physics.drive import Drive
 from capsule_id.physics.forces import (
     Array,
     along_ground,
@@ -22,7 +21,7 @@ from capsule_id.physics.forces import (
     weights_along,
 )
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Trajectory, admissible
+from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Drive, Initial, Trajectory, admissible
 from capsule_id.physics.smooth.march import Field, Problem, differentiable_run
 
 # friction: The smoothed stick-slip rule, and the force gate of eq. (2) to the letter; any friction law, forces in N.

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from capsule_id.physics.batches import folded
-from capsule_id.physics.drive import Drive
-from capsule_id.physics.model import Status
+from capsule_id.physics.model import Drive, Status
 
 # rosenbrock: One step of RODAS3, the solver of the smoothed model: state, linear algebra, error estimate, step control.
 #

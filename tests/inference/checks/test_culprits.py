@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.checks.posterior import RunsAlone, agreement, disagreement
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior

@@ -9,8 +9,7 @@ import pytest
 from scipy import stats
 
 import capsule_id as cid
-from capsule_id.experiments import make_experiments
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.checks.posterior import check_maximum, check_starts, modes
 from capsule_id.inference.pipeline import higher_maximum, sample_posterior, stage_seeds
 from capsule_id.inference.point_fit import point_fit

@@ -8,11 +8,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.checks.posterior import (
     STATISTICS,
     check_statistics,

@@ -11,7 +11,7 @@ from scipy import stats
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.checks.posterior import conflicts
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.point_stage import SampledFit

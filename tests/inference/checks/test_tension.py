@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.dynamic_friction import DISTANCE_SD, SPEED_SD, pushes
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.static_friction import tilts
 from capsule_id.inference.point_stage import tension
 from capsule_id.rig.model import Column, Quantity, Rig, Table

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.checks.verdict import trust_words
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.point_stage import SampledFit

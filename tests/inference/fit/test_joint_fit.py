@@ -17,8 +17,8 @@ from scipy import optimize
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference import joint_fit as joint_starts
 from capsule_id.inference import joint_fit as module
 from capsule_id.inference.checks.posterior import check_starts

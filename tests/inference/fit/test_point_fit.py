@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize
 
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.checks.posterior import check_starts
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.point_fit import dispersed_starts, point_fit

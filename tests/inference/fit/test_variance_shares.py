@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 import capsule_id as cid
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import STATED, PointFit
 from capsule_id.inference.tables import share_table

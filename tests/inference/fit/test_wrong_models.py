@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.twin import NOISE_SD
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference import point_stage
 from capsule_id.inference.checks.verdict import check_whiteness
 from capsule_id.inference.point_stage import SampledFit, fit_points

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.progression.density import Emulator, RunEmulator, _cosine
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference import moves

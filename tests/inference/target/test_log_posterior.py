@@ -14,11 +14,10 @@ from scipy import integrate, stats
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment, ValuesBySymbol, no_design
 from capsule_id.experiments.dynamic_friction import PUSH_SCATTER
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.static_friction import TILT_SD
 from capsule_id.inference.marginal import density_of

@@ -12,8 +12,8 @@ from scipy import integrate, optimize, stats
 
 import tests.experiments.bench as bench
 from capsule_id.api import read_rig
-from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.curvature import BATCH, hessian
 from capsule_id.inference.marginal import HEAVY, MarginalPosterior, conditional, density_of, uniform_at
 from capsule_id.inference.result import PointFit
