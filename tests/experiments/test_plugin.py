@@ -235,7 +235,7 @@ def test_the_kind_of_the_guide_follows_the_friction_law_by_name(
 ) -> None:
     """Before: a kind of another package had to read mu, and a law of the user's own beside it was refused."""
     rig = read_rig(towed(tmp_path / "rig"), towing)
-    (e,) = experiments.make_experiments(rig, registry=towing, friction=law)
+    (e,) = registry.make_experiments(rig, registry=towing, friction=law)
     weight, v = 0.64 * rig.g.value, e.table["speed"]
     if law is None:
         own = {"mu": 0.6, "v_s": 0.1}
@@ -251,7 +251,7 @@ def test_the_kind_of_the_guide_follows_the_friction_law_by_name(
     expected = np.sum(stats.norm.logpdf(e.observed, force, sd))
     for xp in (np, jnp):
         assert float(e.log_likelihood(theta, xp)) == pytest.approx(expected, rel=1e-10)
-    (panel,) = experiments.compare([e], theta, [theta, theta], towing)
+    (panel,) = registry.compare([e], theta, [theta, theta], towing)
     assert (panel.kind, len(panel.curves[0].y)) == ("towing", 60)
 
 
@@ -281,7 +281,7 @@ def test_a_table_with_one_column_is_a_test_too() -> None:
 @pytest.mark.full
 def test_the_kind_of_the_guide_recovers_a_law_of_the_users_own(towing: Registry, tmp_path: Path) -> None:
     rig = read_rig(towed(tmp_path / "rig"), towing)
-    fit = point_fit(LogPosterior(rig, experiments.make_experiments(rig, registry=towing, friction=Lorentzian)), 0)
+    fit = point_fit(LogPosterior(rig, registry.make_experiments(rig, registry=towing, friction=Lorentzian)), 0)
     for name, truth in vars(TRUTH).items():
         assert abs(fit.values[name] - truth) < 4.0 * fit.standard_errors[name] < 0.4 * truth
 
@@ -307,7 +307,7 @@ def test_a_built_in_kind_is_one_folder_and_one_line(
     kinds = default_registry.__wrapped__()
     assert list(kinds) == [*KINDS, "rolling_resistance"]
     rig = read_rig(folder, kinds)
-    (experiment,) = experiments.make_experiments(rig, registry=kinds)
+    (experiment,) = registry.make_experiments(rig, registry=kinds)
     fit = point_fit(LogPosterior(rig, [experiment]), 0)
     assert fit.values["c_rr"] == pytest.approx(sum(FORCES) / len(FORCES) / (0.640 * 9.81), rel=2e-3)
     for name in [name for name in sys.modules if "rolling_resistance" in name]:
