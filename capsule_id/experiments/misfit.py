@@ -202,7 +202,7 @@ class Misfit:
     fixed_variance, scale : () or (n,); both () where all readings have one variance
     design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
     ordinate : fixed variance and scale of the readings' own error where true abscissas are integrated out along the
-        model; they normalise the density (see ``capsule_id.experiments.line``)
+        model; they normalise the density (see ``capsule_id.experiments.point_test``)
     """
 
     raw: Any

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
-from capsule_id.experiments.line import MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
+from capsule_id.experiments.point_test import LINE_MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
 from capsule_id.parameters import INSTRUMENT_ERRORS
 from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ColumnRule, QuantityRule
@@ -67,7 +67,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="K",
     captions={"motor_current": "Counterpart of the paper's Fig. 3: the slope of the line is K."},
-    messages=MESSAGES,
+    messages=LINE_MESSAGES,
     lint=(lint_line,),
     paper=line_estimates,
     twin=_measure,

@@ -6,7 +6,7 @@ little more than ``predict``.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, ClassVar
@@ -15,8 +15,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
+from scipy import stats
 
-from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label, band, no_design
+from capsule_id.experiments.base import (
+    LEVEL,
+    About,
+    Start,
+    ValuesBySymbol,
+    axis_label,
+    band,
+    no_design,
+    refit,
+    scatter_prior,
+)
+from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
     FrictionModel,
@@ -25,11 +38,13 @@ from capsule_id.experiments.friction_model import (
     ground_parameters,
     instrument_parameters,
 )
-from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.kind import Values
+from capsule_id.experiments.lint import lint_reading_errors, lint_rows
+from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.rig.schema import GroundSettings
-from capsule_id.views import Comparison, Curve, Points
+from capsule_id.rig.schema import Entry, GroundSettings
+from capsule_id.views import Comparison, Curve, Finding, Message, Points, ResultTable
 
 #: Name of the friction law of the fit in ``PointTest.reads``.
 FRICTION = "friction"
@@ -190,3 +205,320 @@ def _slopes(test: PointTest, theta: ValuesBySymbol) -> dict[str, jax.Array]:
         return jax.jvp(lambda x: test.shown(theta, {**test.readings, name: x}), (x,), (jnp.ones_like(x),))[1]
 
     return {name: slope(name) for name in test.uncertain}
+
+
+# line: Shared declarations of calibration lines: rule on reading errors, the paper's straight line, lint.
+
+
+LINE_MESSAGES = {
+    "lines.rise": Message(
+        "linearity",
+        fail="{name} is positive, but the line falls: {slope:.3g} {unit}. Check the signs of {x} and {y}.",
+    ),
+    "lines.straight": Message(
+        "linearity",
+        ok="no bend in {number:# calibration line}",
+        fail=(
+            "expected a straight line; a parabola departs from it by {departure:.1%} of the range at mid range "
+            "({p:p}), so {name} depends on where it is read. Use the part of the range that the runs use."
+        ),
+    ),
+    "lines.replicates": Message(
+        "repeated readings",
+        ok="the means of repeated readings lie on {number:# calibration line}",
+        fail=(
+            "expected the means of repeated readings on the line; they deviate by {deviation:.1f} sd of a reading "
+            "({p:p}), so {name} has errors that repetition does not show. Set {x} anew before each reading, and check "
+            "for hysteresis."
+        ),
+    ),
+    "lines.two_rows": Message(
+        "scatter of calibration lines",
+        warn=(
+            "two readings show nothing of their own scatter, so the sd of {name} follows from an assumed one. State {y}_sd, "
+            "or measure more rows."
+        ),
+    ),
+    "lines.step": Message(
+        "scatter of calibration lines",
+        warn=(
+            "the readings scatter less about the line than rounding to {step:g} {unit}, their last digit, lets them, so the "
+            "sd of {name} follows from this step. State {y}_resolution or {y}_sd."
+        ),
+    ),
+    "lines.slopes": Message(
+        "Calibration lines",
+        caption=(
+            "Slopes by generalised least squares. The ordinary line is the paper's estimate. Flagged rows are shown, not "
+            "dropped."
+        ),
+    ),
+}
+
+
+def line_estimates(experiments: Sequence["Line"]) -> Values:
+    """Return the slopes of ordinary straight lines, by name; the mean over tables."""
+    slopes = [(e.slope.name, e.ordinary_line()[0]) for e in experiments]
+    return {name: float(np.mean([slope for own, slope in slopes if own == name])) for name, _ in slopes}
+
+
+def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
+    """Reject ``sd_ratio`` where both reading errors are stated, because they already define the ratio.
+
+    Raises
+    ------
+    InputError
+        If ``sd_ratio`` and both reading errors are stated.
+    """
+    columns = entry.table.columns
+    if entry.table.settings.sd_ratio is not None and all(column.sd is not None for column in columns.values()):
+        one, other = (f"{name}_sd" for name in sorted(columns, key=lambda name: name != "force"))
+        rule = f"state sd_ratio or both of {one} and {other}"
+        raise entry.error("sd_ratio", rule, "all three", "remove sd_ratio", of_key=True)
+
+
+def lint_line(table: Table[Any], rig: Rig) -> Iterable[Finding]:
+    """Report few rows and missing reading errors."""
+    yield from lint_rows(table, rig, 5)
+    if table.settings.sd_ratio is None:
+        yield from lint_reading_errors(table, rig)
+
+
+# line replicates: Lack of fit of a calibration line against the scatter of repeated readings.
+
+
+#: Values of x closer than this count as repeated, relative to their range.
+SAME = 1e-9
+#: Smallest deviation of the levels from the line that counts, in sd of the repeated readings.
+SMALLEST_DEVIATION = 0.5
+
+
+def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Check that the means of repeated readings lie on the line (F test; Draper & Smith 1998, section 2.1)."""
+    tests = []
+    for e in lines:
+        keep = np.setdiff1d(np.arange(e.n), fit.flagged.get(e.label, []))
+        tests += [(e, *found) for found in [lack_of_fit(e.x[keep], e.observed[keep])] if found is not None]
+    findings = [
+        Finding("lines.replicates", "fail", {"name": e.slope.name, "x": e.x_name, "deviation": size, "p": p}, e.label)
+        for e, size, p in tests
+        if p * len(lines) < LEVEL and size > SMALLEST_DEVIATION
+    ]
+    return findings or [Finding("lines.replicates", "ok", {"number": len(tests)})] * bool(tests)
+
+
+def lack_of_fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
+    """Deviation of the levels from the line, in sd of repeated readings, and p-value; None without repetitions."""
+    order = np.argsort(x, kind="stable")
+    level = np.concatenate([[0], np.cumsum(np.diff(x[order]) > SAME * np.ptp(x))])
+    count = np.bincount(level)
+    levels, freedom = len(count), len(x) - len(count)
+    if levels < 3 or freedom < 3:
+        return None
+    mean = np.bincount(level, y[order]) / count
+    within = float(np.sum((y[order] - mean[level]) ** 2)) / freedom
+    total = np.polyval(np.polyfit(x, y, 1), x[order])
+    between = float(np.sum((mean[level] - total) ** 2)) / (levels - 2)
+    if within == 0.0:
+        return None
+    size = len(x) / levels
+    return float(np.sqrt(max(between / within - 1.0, 0.0) / size)), float(
+        stats.f.sf(between / within, levels - 2, freedom)
+    )
+
+
+# line experiment: Calibration line y = y0 + slope x, shared by motor current and support spring.
+#
+# Both columns have errors where both reading errors, or their ratio, are stated. Otherwise the model has one total
+# scatter about the line, in addition to any stated reading error. The true point of a reading is integrated out along
+# the line. Its prior is flat in length, in units of the reading errors, so that neither column is preferred. Where one
+# reading error alone is stated, it is flat in x, because the other error is not known.
+# The slope is then that of orthogonal (Deming) regression (Hogg, Bovy & Lang 2010, section 7; Fuller 1987, section
+# 1.3).
+# A prior flat in x would bias the slope towards ordinary least squares, by -(sd_x / sd of the x's)^2 relative. The
+# intercept is integrated out under a wide normal prior.
+
+
+#: Factor of the default prior of a scatter where the table has too few rows to show any.
+SCATTER_FACTOR_OF_FEW = 3.0
+
+
+def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Check that calibration lines rise and are straight, without flagged rows."""
+    findings = []
+    for e in lines:
+        theta, left_out = e.local(fit.values), fit.flagged.get(e.label, [])
+        # One outlier can tilt the whole line. The outlier check reports it, so it is excluded here.
+        slope = refit(e, theta, left_out)[e.symbol][0]
+        if slope <= 0.0:
+            facts = {"name": e.slope.name, "slope": slope, "unit": e.slope.unit, "x": e.x_name, "y": e.reading}
+            findings.append(Finding("lines.rise", "fail", facts, e.label))
+            continue
+        bend, p = curvature_test(e, theta, left_out)
+        if p * len(lines) < LEVEL:
+            facts = {"name": e.slope.name, "departure": bend, "p": p}
+            findings.append(Finding("lines.straight", "fail", facts, e.label))
+    return findings or [Finding("lines.straight", "ok", {"number": len(lines)})]
+
+
+def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Report lines whose scatter the readings do not show: two rows, or readings closer to the line than their step."""
+    findings = []
+    for e in lines:
+        column = e.table.columns[e.reading]
+        if e.scale_known or (e.n > 2 and e.step == 0.0) or (column.sd is not None and e.n < 3):
+            continue
+        code = "lines.two_rows" if e.n < 3 else "lines.step"
+        facts = {"y": e.reading, "unit": column.unit, "step": e.step * column.to_display, "name": e.slope.name}
+        findings.append(Finding(code, "warn", facts, e.label, (e.slope.name,)))
+    return findings
+
+
+def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int]) -> tuple[float, float]:
+    """Test a calibration line for curvature: relative deviation of the best parabola at mid range, and p-value."""
+    misfit = line.misfit(theta)
+    keep = np.setdiff1d(np.arange(line.n), left_out)
+    x, sd = line.x[keep], misfit.sd[keep]
+    z = (x - np.mean(x)) / (np.ptp(x) or 1.0)
+    if len(keep) < 4 or len(np.unique(np.round(z, 9))) < 3:
+        return 0.0, 1.0
+    variances = "unscaled" if line.scale_known else True
+    coefficients, covariance = np.polyfit(z, line.observed[keep], 2, w=1.0 / sd, cov=variances)
+    score = abs(coefficients[0]) / np.sqrt(max(covariance[0, 0], 1e-300))
+    p = 2.0 * (stats.norm.sf(score) if line.scale_known else stats.t.sf(score, len(keep) - 3))
+    return float(coefficients[0] * 0.25 / abs(coefficients[1])), float(p)
+
+
+def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
+    """Compare the slopes with and without flagged rows and the paper's ordinary line."""
+    rows = []
+    for e in lines:
+        theta, left_out = e.local(fit.values), fit.flagged.get(e.label, [])
+        value, sd = refit(e, theta, [])[e.symbol]
+        row: dict[str, object] = {
+            "table": e.label,
+            "slope": f"{e.slope.name}, {e.slope.unit}",
+            "all rows": value,
+            "±": sd,
+            "ordinary line": e.ordinary_line()[0],
+        }
+        if fit.flagged:
+            without = refit(e, theta, left_out)[e.symbol] if left_out else (np.nan, np.nan)
+            row |= {"without flagged rows": without[0], "± without": without[1]}
+        length = getattr(e.table.settings, "length", None)
+        rows.append(row | ({} if length is None else {"length, m": length.value}) | {"errors": e.errors})
+    return [ResultTable("lines.slopes", pd.DataFrame(rows).set_index("table"))]
+
+
+class Line(PointTest):
+    """A line y against x; subclasses name the columns and the slope.
+
+    Attributes
+    ----------
+    width : sd of the intercept's prior, SI
+    sd_ratio : stated ratio of both errors; None: not stated
+    step : step of the last digit of y, SI, where it exceeds the scatter about the line and no error of y is stated; else 0
+    scale_known : whether both reading errors are stated
+    """
+
+    width: float
+    sd_ratio: float | None
+    step: float
+    scale_known: bool = eqx.field(static=True)  # type: ignore[misc]  # pyright: ignore
+
+    #: Column of x, and symbol of the slope.
+    x_name: ClassVar[str]
+    symbol: ClassVar[str]
+    #: SI unit of y.
+    unit_of_y: ClassVar[str] = "N"
+    relative = False
+    estimates_may_be_negative = True
+    checks = (check_linearity, check_replicates, check_scatter)
+    tables = (line_table,)
+
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        y = table.columns[self.reading]
+        self.width, self.sd_ratio = NUISANCE_WIDTH * float(np.ptp(y.values)), table.settings.sd_ratio
+        self.scale_known = all(table.columns[name].sd is not None for name in (self.x_name, self.reading))
+        super().__init__(table, rig, friction)
+        step = y.unstated_step
+        self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
+        self.sds = {**self.sds, self.reading: max(self.sds[self.reading], self.step / np.sqrt(12.0))}
+
+    def slope_of(self, table: Table) -> Parameter:
+        """Row of the slope."""
+        return parameter(self.symbol)
+
+    def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
+        slope, prior = self.slope_of(table), scatter_prior(float(np.ptp(self.observed)))
+        prior = prior if self.n > 2 else replace(prior, spread=SCATTER_FACTOR_OF_FEW)
+        scatter = replace(parameter("scatter", table.label, prior), unit=self.unit_of_y)
+        return (slope,) if self.scale_known else (slope, scatter)
+
+    @property
+    def x(self) -> np.ndarray:
+        return self.readings[self.x_name]
+
+    @property
+    def slope(self) -> Parameter:
+        return self.parameters[0]
+
+    @property
+    def scatters(self) -> tuple[str | None, ...]:
+        return (None,) if self.scale_known else ("scatter",)
+
+    def unstated_errors(self, symbol: str) -> set[str]:
+        """The intercept takes up the zeros of both columns."""
+        return super().unstated_errors(symbol) - {"zero"}
+
+    @property
+    def errors(self) -> str:
+        """Error model in words, for the report."""
+        if self.scale_known:
+            return "errors in both columns, as stated"
+        if self.sd_ratio is not None:
+            return "errors in both columns, their ratio as stated, their size estimated"
+        return "one total scatter about the line (the reading errors of both columns are not stated)"
+
+    def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        return theta[self.symbol] * x[self.x_name]
+
+    def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
+        """The slope of the readings, which the gains of both instruments change."""
+        return {self.x_name: self.as_read(theta[self.symbol], self.x_name, theta)}
+
+    def design(self, n: int, xp: ModuleType = jnp) -> Any:
+        return self.width * xp.ones((n, 1))
+
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
+        (plain,) = super().misfits(theta, xp)
+        if self.scale_known:
+            return (replace(plain, scale=0.0, ordinate=(self.sds[self.reading] ** 2, 0.0)),)
+        if self.sd_ratio is None:
+            return (plain,)
+        # Readings scatter in x too. The ratio of both errors must not depend on the scatter: its density would then have
+        # no upper limit at 0.
+        total = 1.0 + (self.slopes(theta)[self.x_name] / self.sd_ratio) ** 2
+        return (replace(plain, scale=xp.sqrt(total), ordinate=(plain.fixed_variance / total, 1.0)),)
+
+    def ordinary_line(self) -> tuple[float, float, float]:
+        """Slope, intercept and residual sd of ordinary least squares, the paper's fit; slope 0 at one level of x."""
+        x, y = self.x - np.mean(self.x), self.observed - np.mean(self.observed)
+        slope = x @ y / (x @ x) if x @ x > 0.0 else 0.0
+        intercept = np.mean(self.observed) - slope * np.mean(self.x)
+        rest = y - slope * x
+        return float(slope), float(intercept), float(np.sqrt(rest @ rest / max(self.n - 2, 1)))
+
+    def starts(self) -> dict[str, Start]:
+        slope, _, sd = self.ordinary_line()
+        starts = {self.slope.name: Start(abs(slope), 0.4)}
+        if not self.scale_known:
+            starts[f"scatter[{self.label}]"] = Start(max(sd, 1e-6 * float(np.ptp(self.observed))), 0.3)
+        return starts
+
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+        panel, (slope, intercept, _) = super().comparison(theta, draws), self.ordinary_line()
+        x, columns = panel.curves[0].x, self.table.columns
+        paper = intercept + slope * x / columns[self.x_name].to_display
+        curve = Curve("the paper's fit", x, paper * columns[self.reading].to_display, role="paper")
+        return replace(panel, curves=(*panel.curves, curve))

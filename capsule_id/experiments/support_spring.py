@@ -10,8 +10,7 @@ from scipy import stats
 from capsule_id.experiments.base import LEVEL, refit
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
-from capsule_id.experiments.line import MESSAGES as LINE_MESSAGES
-from capsule_id.experiments.line import Line, line_estimates, lint_line, refuse_idle_sd_ratio
+from capsule_id.experiments.point_test import LINE_MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
 from capsule_id.parameters import INSTRUMENT_ERRORS, Parameter, by_index, parameter
 from capsule_id.rig.model import Quantity, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.experiments.line import MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
+from capsule_id.experiments.point_test import LINE_MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
 from capsule_id.parameters import INSTRUMENT_ERRORS, Parameter, Prior
 from capsule_id.rig.model import Settings, Table
 from capsule_id.rig.schema import ColumnRule, QuantityRule
@@ -50,7 +50,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="sensitivity of that transducer",
     captions={"transducer": "The slope of the line is the sensitivity of the transducer."},
-    messages=MESSAGES,
+    messages=LINE_MESSAGES,
     lint=(lint_line,),
     paper=line_estimates,
 )

@@ -8,7 +8,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.experiments.line import lack_of_fit
+from capsule_id.experiments.point_test import lack_of_fit
 from capsule_id.inference.checks.settings import ORDER_LEVEL, POWER, added_effect, between, heterogeneity, lag_1
 from tests.measured.folders import Entry, make_rig, quantity
 
