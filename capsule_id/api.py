@@ -36,8 +36,7 @@ from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.parameters import by_index, is_stated
-from capsule_id.physics.forces import Force, warn_of_far_gap
-from capsule_id.physics.friction import FrictionLaw
+from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
 from capsule_id.physics.model import CapsuleParameters, Drive, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.precision import prepare_xla

@@ -16,7 +16,7 @@ from capsule_id.output import replace_files
 from capsule_id.parameters import TABLE, TABLE_1
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
-from capsule_id.physics.friction import friction_law, scaled
+from capsule_id.physics.forces import friction_law, scaled
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.rig.model import Rig
 from capsule_id.rig.toml import NAME_PATTERN

@@ -25,7 +25,7 @@ from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors
 from capsule_id.parameters import INSTRUMENT_ERRORS, Prior, scatter
 from capsule_id.physics.batches import array_module
-from capsule_id.physics.friction import FrictionLaw, normal_force, slide_distance
+from capsule_id.physics.forces import FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry
 from capsule_id.rig.toml import POSITIVE

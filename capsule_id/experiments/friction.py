@@ -19,7 +19,7 @@ from capsule_id.experiments.lint import lint_rows
 from capsule_id.experiments.point_test import FRICTION, PointTest
 from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import array_module
-from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force, slide_distance
+from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings
 from capsule_id.rig.toml import POSITIVE

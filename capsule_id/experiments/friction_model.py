@@ -11,8 +11,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.parameters import INSTRUMENT_ERRORS, Name, Parameter, Prior, parameter
-from capsule_id.physics.forces import Force
-from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force, scaled
+from capsule_id.physics.forces import CoulombStribeck, Force, FrictionLaw, normal_force, scaled
 from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 
 # friction model: Friction law of a fit: its sampled parameters, and the law at given values.
@@ -79,7 +78,7 @@ class FrictionModel:
             raise InputError(
                 "friction must be a class with parameters, forward(speed) and backward(speed)",
                 repr(law),
-                "give the class itself; see capsule_id.physics.friction.FrictionLaw",
+                "give the class itself; see capsule_id.physics.forces.FrictionLaw",
             )
         _check_leaves(f"the friction law {law.__name__}", law, NORMAL_FORCE, "the weight, N", lambda: self._at({}, 1.0))
         if contact is None:

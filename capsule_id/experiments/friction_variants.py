@@ -12,7 +12,7 @@ from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior
-from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.physics.forces import CoulombStribeck
 from capsule_id.views import Finding
 
 # friction variants: Variants of the friction law, compared by their marginal likelihoods on the friction experiments.

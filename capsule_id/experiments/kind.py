@@ -25,8 +25,7 @@ from capsule_id.views import Comparison, Finding, Message
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
     from capsule_id.experiments.friction_model import FrictionModel
-    from capsule_id.physics.forces import Force
-    from capsule_id.physics.friction import FrictionLaw
+    from capsule_id.physics.forces import Force, FrictionLaw
 
 
 # kind: Declaration of one kind of experiment: its complete interface to the rest of the package.

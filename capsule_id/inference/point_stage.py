@@ -22,7 +22,7 @@ from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import sample
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import is_stated
-from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.physics.forces import CoulombStribeck
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
 

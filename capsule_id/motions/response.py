@@ -13,7 +13,7 @@ from capsule_id.errors import InputError
 from capsule_id.physics.batches import CHUNK, is_traced, lanes_of, run_lanes
 from capsule_id.physics.exact.engine import RunState, initial_lanes, kernel, run, take_step
 from capsule_id.physics.exact.taylor import CapsuleState, StepSeries, constants_of, touching
-from capsule_id.physics.friction import FrictionLaw, friction_law, horner
+from capsule_id.physics.forces import FrictionLaw, friction_law, horner
 from capsule_id.physics.model import (
     MAX_STEPS,
     CapsuleParameters,

@@ -13,7 +13,7 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from capsule_id.physics.batches import CHUNK, folded
-from capsule_id.physics.friction import FrictionLaw
+from capsule_id.physics.forces import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Drive, Status, without_absent
 from capsule_id.physics.simulation import simulate
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from capsule_id.errors import InputError
 from capsule_id.parameters import DRIVES, TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, Record, array_module
-from capsule_id.physics.friction import DEGREE, Series
+from capsule_id.physics.forces import DEGREE, Series
 from capsule_id.physics.model import Drive, Piece
 
 # pulses: Pulses of a coil: P_on and P_off in turn, through a first-order lag (the coil's L/R).

@@ -15,8 +15,7 @@ from capsule_id.errors import InputError
 from capsule_id.physics.batches import lanes_of
 from capsule_id.physics.exact.engine import initial_lanes, march, values_of
 from capsule_id.physics.exact.taylor import constants_of
-from capsule_id.physics.forces import downhill, forces_of
-from capsule_id.physics.friction import FrictionLaw, friction_law, sliding_friction
+from capsule_id.physics.forces import FrictionLaw, downhill, forces_of, friction_law, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Drive, Initial, Status, without_absent
 
 # Quadrature nodes per step: exact for the square of a velocity polynomial of degree 12.

@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module, is_traced
-from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, Series
+from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, Series, downhill, rod_on_capsule
 
 # drives: The force on the rod at any time, and what a Taylor step needs of it.
 
@@ -395,3 +395,10 @@ class Trajectory:
     def x_rel(self) -> jax.Array:
         """X1 - X2, (n,), m: positive towards the support spring."""
         return self.X1 - self.X2
+
+
+def rod_acceleration(p: Any, drive: Drive, t: Any, r: Any, w: Any) -> Any:
+    """X1'', m/s^2, at the times t: the reading of an accelerometer on the rod."""
+    if drive.prescribed:
+        return drive.force_at(t)
+    return (drive.force_at(t) - rod_on_capsule(p, r, w) - downhill(p, p.m1)) / p.m1

@@ -10,7 +10,7 @@ from capsule_id.errors import InputError
 from capsule_id.physics.batches import is_traced, lanes_of, run_lanes
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.exact import engine as exact
-from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law
+from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, friction_law
 from capsule_id.physics.model import (
     MAX_STEPS,
     CapsuleParameters,

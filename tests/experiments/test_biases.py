@@ -11,7 +11,7 @@ from capsule_id.experiments.friction import unit_law
 from capsule_id.experiments.kind import make_experiments, paper_estimates
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
-from capsule_id.physics.friction import slide_distance
+from capsule_id.physics.forces import slide_distance
 from capsule_id.rig.model import Rig
 
 TIME = np.arange(1000) / 2000.0  # s

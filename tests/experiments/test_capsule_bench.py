@@ -18,7 +18,7 @@ from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.point_stage import SampledFit, fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
-from capsule_id.physics.friction import slide_distance
+from capsule_id.physics.forces import slide_distance
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import ModelChoices, Quantity, Table
 from tests.experiments import bench

@@ -21,8 +21,7 @@ from capsule_id.inference.moves import ChainStore
 from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
-from capsule_id.physics.forces import Force, Spring
-from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.physics.forces import CoulombStribeck, Force, Spring
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table

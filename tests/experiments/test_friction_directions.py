@@ -9,7 +9,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import make_experiments
-from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.physics.forces import CoulombStribeck
 from tests.measured.folders import Entry, make_rig, named_line, quantity
 
 LAW = CoulombStribeck(0.66, 1.0, 0.3, mu_back=0.45)

@@ -14,7 +14,7 @@ from capsule_id.experiments.friction import FrictionExperiment, paper_friction_f
 from capsule_id.experiments.friction_model import FrictionModel, model_lines
 from capsule_id.experiments.friction_variants import VariantPoints, check_variants, fit_variant, order_p
 from capsule_id.experiments.kind import make_experiments
-from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.physics.forces import CoulombStribeck
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
 from tests.experiments import bench

@@ -23,7 +23,7 @@ PLACES: dict[str, list[tuple[str, str]]] = {
         )
     ],
     "physics/model.py": [FIELD],
-    "physics/friction.py": [
+    "physics/forces.py": [
         FIELD,
         ('        TABLE["viscous"],\n', '        TABLE["viscous"],\n        TABLE["rise"],\n'),
         ("* weakening + self.viscous * speed", "* (weakening + self.rise * speed / self.v_s) + self.viscous * speed"),

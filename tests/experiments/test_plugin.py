@@ -27,7 +27,7 @@ from capsule_id.experiments.point_test import PointTest
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior, scatter
-from capsule_id.physics.friction import FrictionLaw
+from capsule_id.physics.forces import FrictionLaw
 from capsule_id.rig.model import Settings, Table
 from tests import cli_tools
 from tests.experiments import bench

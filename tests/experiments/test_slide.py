@@ -9,7 +9,7 @@ from bench import G
 from scipy import integrate, special
 
 from capsule_id.experiments.friction import paper_friction_fit, unit_law
-from capsule_id.physics.friction import slide_distance
+from capsule_id.physics.forces import slide_distance
 
 MU, V_S = 0.66, 0.30
 RATIOS = np.geomspace(1e-3, 50.0, 25)  # v / v_s

@@ -9,7 +9,7 @@ import pytest
 
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
-from capsule_id.physics.friction import CoulombStribeck, Scaled, friction_law, scaled
+from capsule_id.physics.forces import CoulombStribeck, Scaled, friction_law, scaled
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import jit_quickly

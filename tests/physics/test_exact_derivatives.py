@@ -9,7 +9,7 @@ import pytest
 
 from capsule_id.physics.exact import engine as exact
 from capsule_id.physics.exact.taylor import GAP, NONE, VELOCITY, CapsuleState, Constants, Mode, StepSeries
-from capsule_id.physics.friction import friction_law
+from capsule_id.physics.forces import friction_law
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, without_absent
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases, jit_quickly, states_of

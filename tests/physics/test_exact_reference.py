@@ -5,7 +5,7 @@ import pytest
 
 from capsule_id.physics.exact import engine as exact
 from capsule_id.physics.exact import taylor
-from capsule_id.physics.friction import friction_law
+from capsule_id.physics.forces import friction_law
 from capsule_id.physics.model import Status, without_absent
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases, jit_quickly, states_of

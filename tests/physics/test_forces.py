@@ -16,8 +16,7 @@ from capsule_id.parameters import Parameter
 from capsule_id.physics import forces as steps
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.energy import energy_balance
-from capsule_id.physics.forces import Force, Spring
-from capsule_id.physics.friction import CoulombStribeck, sliding_friction
+from capsule_id.physics.forces import CoulombStribeck, Force, Spring, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import breakaway, force_gate, friction_smooth

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.physics.friction import CoulombStribeck, friction_law, slide_distance
+from capsule_id.physics.forces import CoulombStribeck, friction_law, slide_distance
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import assert_both_ways_as_scipy, jit_quickly, states_of

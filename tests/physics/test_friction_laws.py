@@ -14,7 +14,7 @@ import capsule_id as cid
 from capsule_id.parameters import Parameter
 from capsule_id.physics.energy import energy_balance
 from capsule_id.physics.exact.taylor import by_chain_rule
-from capsule_id.physics.friction import (
+from capsule_id.physics.forces import (
     CoulombStribeck,
     FrictionLaw,
     FrictionSeries,

@@ -12,7 +12,7 @@ import pytest
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.drives import RecordedDrive
 from capsule_id.physics.exact.engine import SHORTEST, as_one_function
-from capsule_id.physics.friction import Scaled
+from capsule_id.physics.forces import Scaled
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 from capsule_id.physics.simulation import simulate
 from tests.capsule_cases import Cases, states_of

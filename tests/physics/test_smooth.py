@@ -12,8 +12,7 @@ from scipy.integrate import solve_ivp
 from capsule_id.errors import InputError
 from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import CHUNK
-from capsule_id.physics.forces import Spring, smooth_abs
-from capsule_id.physics.friction import friction_law
+from capsule_id.physics.forces import Spring, friction_law, smooth_abs
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 from capsule_id.physics.simulation import simulate, smoothing_bias
 from capsule_id.physics.smooth import engine as smooth

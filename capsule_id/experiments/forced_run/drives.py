@@ -21,9 +21,16 @@ from capsule_id.experiments.forced_run.start_state import RunStart, rough_start,
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
 from capsule_id.experiments.kind import Estimate
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
-from capsule_id.physics.forces import downhill, grazing_load, rod_acceleration, rod_on_capsule
-from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Status, Trajectory, without_absent
+from capsule_id.physics.forces import FrictionLaw, downhill, grazing_load, rod_on_capsule
+from capsule_id.physics.model import (
+    CapsuleParameters,
+    Drive,
+    Excitation,
+    Status,
+    Trajectory,
+    rod_acceleration,
+    without_absent,
+)
 from capsule_id.records.motion import fit_mean_velocity, measured_motion
 from capsule_id.records.tones import relative_position, stated_gap, stated_Omega, tone_at
 from capsule_id.records.view import view_record

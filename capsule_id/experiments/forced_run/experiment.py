@@ -34,9 +34,8 @@ from capsule_id.experiments.friction_model import (
 )
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.physics.forces import equilibrium, rod_acceleration
-from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory
+from capsule_id.physics.forces import FrictionLaw, equilibrium
+from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory, rod_acceleration
 from capsule_id.records.tones import stated_gap, stated_Omega
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Facts, Finding

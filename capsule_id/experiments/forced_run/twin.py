@@ -11,8 +11,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.declaration import RUN_SPRINGS, SETTLING_PERIODS
 from capsule_id.experiments.kind import Twin, TwinTable, Values
 from capsule_id.parameters import QUANTILE_975
-from capsule_id.physics.forces import rod_acceleration
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, status_message
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status, rod_acceleration, status_message
 from capsule_id.physics.simulation import simulate
 
 #: Number of samples of a record, and time between two, s, where a setup states none.

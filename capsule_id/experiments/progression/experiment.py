@@ -40,8 +40,7 @@ from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import pool
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
-from capsule_id.physics.forces import equilibrium
-from capsule_id.physics.friction import scaled
+from capsule_id.physics.forces import equilibrium, scaled
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Column, Rig, Table

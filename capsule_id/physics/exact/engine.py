@@ -36,8 +36,7 @@ from capsule_id.physics.exact.taylor import (
     touching,
     trusted,
 )
-from capsule_id.physics.forces import Force
-from capsule_id.physics.friction import DEGREE, FrictionLaw, Scaled, horner, mean, sliding_friction
+from capsule_id.physics.forces import DEGREE, Force, FrictionLaw, Scaled, horner, mean, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Drive, Initial, Status, Trajectory, admissible
 
 # one function: A program that XLA compiles as one function on a CPU.

@@ -8,17 +8,21 @@ import jax.numpy as jnp
 from jax.experimental.jet import jet
 
 from capsule_id.errors import InputError
-from capsule_id.physics.forces import Force, along_ground, forces_of, total, weights_along
-from capsule_id.physics.friction import (
+from capsule_id.physics.forces import (
     DEGREE,
+    Force,
     FrictionLaw,
     FrictionSeries,
     Series,
+    along_ground,
     divide,
+    forces_of,
     horner,
     increase,
     mean,
     sliding_friction,
+    total,
+    weights_along,
 )
 from capsule_id.physics.model import CapsuleParameters, Drive
 

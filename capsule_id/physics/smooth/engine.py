@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from capsule_id.physics.forces import (
     Array,
+    FrictionLaw,
     along_ground,
     forces_of,
     rod_on_capsule,
@@ -20,7 +21,6 @@ from capsule_id.physics.forces import (
     total,
     weights_along,
 )
-from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Drive, Initial, Trajectory, admissible
 from capsule_id.physics.smooth.march import Field, Problem, differentiable_run
 
