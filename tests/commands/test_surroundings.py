@@ -5,6 +5,7 @@ import os
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,9 +58,17 @@ def fitted(here: Path, name: str, *words: str) -> subprocess.CompletedProcess[by
     return subprocess.run(shell, cwd=here, env=environment(**variables), capture_output=True, timeout=300, check=False)
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "everything" else pytest.param(name, marks=pytest.mark.full) for name in SURROUNDINGS]
-)
+#: What "everything" does not contain; the others are its parts.
+FURTHER = ("JAX's cache in no folder", "ASCII streams", "no streams", "warnings as errors", "without docstrings")
+
+
+def marked(name: str) -> Any:
+    """The core has all surroundings at once, the full tier what they do not contain."""
+    marks = pytest.mark.full if name in FURTHER else pytest.mark.slow
+    return name if name == "everything" else pytest.param(name, marks=marks)
+
+
+@pytest.mark.parametrize("name", [marked(name) for name in SURROUNDINGS])
 def test_a_fit_ends_with_its_result(tmp_path: Path, name: str) -> None:
     """Each of these ended in an internal failure after the fit, or could have."""
     done = fitted(tmp_path, name, "--no-sample", "--quiet")
@@ -73,7 +82,7 @@ def test_a_fit_ends_with_its_result(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["no such backend", "everything"])
+@pytest.mark.parametrize("name", [pytest.param("no such backend", marks=pytest.mark.slow), "everything"])
 def test_figures_are_the_same_in_all_surroundings(tmp_path: Path, name: str) -> None:
     """The style and the backend are those of the package; a sample too is drawn and read back."""
     pictures, draws = [], []

@@ -223,7 +223,7 @@ def test_a_drift_larger_than_the_motion_is_no_model() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", [6, 10, 17, 32, 74, 107, 118])
+@pytest.mark.parametrize("seed", [10, 17, 32, *(pytest.param(s, marks=pytest.mark.slow) for s in (6, 74, 107, 118))])
 def test_a_random_decay_ends_with_a_verdict_or_is_refused(tmp_path: Path, seed: int) -> None:
     outcome(tmp_path, seed, None)
 

@@ -14,7 +14,7 @@ from tests.inference.calibration import Outcome, study, summarise
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("rigs", [4, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rigs", [2, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_few_rigs(rigs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small version of the next test at a fixed seed: ten numbers of each rig.
 

@@ -34,7 +34,7 @@ def test_twenty_robots(tmp_path: Path) -> None:
     assert max(abs(z) for outcome in outcomes for z in outcome.z.values()) <= 4.0
 
 
-@pytest.mark.full
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_starts")
 def test_a_missing_lag_is_found_and_the_right_fit_is_near_the_truth(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -40,8 +40,8 @@ def test_a_clean_rig_is_recovered_and_nothing_is_named(folder: Path) -> None:
     assert max(map(abs, z.values())) < 4.0, z
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("named", ["k2[medium]", pytest.param("mu", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("named", ["k2[medium]", "mu"])
 def test_a_planted_disagreement_is_named(named: str, tmp_path: Path) -> None:
     place = tmp_path / "rig"
     synthesize(place, 0, runs=True)

@@ -122,7 +122,7 @@ def outcome(folder: Path, name: str, summary: pd.DataFrame, capsys: pytest.Captu
     return "ok" if loaded.summary.equals(summary) else "other numbers"
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.full)])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_any_damage_is_named(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int) -> None:
     found: dict[str, list[str]] = {}
     summary = load(whole).summary

@@ -140,12 +140,13 @@ def test_other_outputs_of_commands(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.full
-def test_every_size_of_disk(tmp_path: Path) -> None:
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_every_size_of_disk(tmp_path: Path, every: int) -> None:
     """A real process; no traceback and no end by a signal. The old result stays; a resumed run gives the same numbers."""
     small_rig(tmp_path / "rig")
     env = environment(XDG_CACHE_HOME=str(tmp_path / "cache"), TMPDIR=str(tmp_path))
     ends = []
-    for size in (None, *SIZES, None):
+    for size in (None, *SIZES[::every], None):
         out = "whole" if size is None and not ends else "out"
         before = listing(tmp_path / out) if (tmp_path / out).exists() else {}
         limit = f"ulimit -f {size // 512}; " if size else ""  # in blocks of 512 bytes
@@ -162,7 +163,7 @@ def test_every_size_of_disk(tmp_path: Path) -> None:
             assert fit_params_in(tmp_path, *WORDS, "--out", out, "--resume") == 0
         same_result(tmp_path / "whole", tmp_path / out)
         assert not list(tmp_path.glob("capsule-id-*"))
-    assert 3 <= [code for _, code in ends].count(1) < len(ends) - 3, ends
+    assert 3 // every <= [code for _, code in ends].count(1) < len(ends) - 3 // every, ends
 
 
 def fit_params_in(folder: Path, *words: str) -> int:
@@ -172,9 +173,11 @@ def fit_params_in(folder: Path, *words: str) -> int:
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_fault_at_every_operation_of_a_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], every: int
 ) -> None:
+    """At every fourth one, and at all of them in the study."""
     small_rig(tmp_path / "rig")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("capsule_id.inference.moves.SAVE_EVERY", np.inf)  # the operations are then the same
@@ -197,8 +200,8 @@ def test_a_fault_at_every_operation_of_a_fit(
         shutil.rmtree(tmp_path / "out")
         if len(operations) <= moment:
             break
-        moment += 1
-    assert refused >= 15
+        moment += every
+    assert refused >= 15 // every
 
 
 #: A map of four points in four blocks.
@@ -207,12 +210,14 @@ MAP += ("--with-to", "6", "--with-points", "2", "--dropped", "20", "--observed",
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("error", [Killed, partial(OSError, errno.ENOSPC, os.strerror(errno.ENOSPC))])
 def test_a_fault_at_every_operation_of_a_map(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     error: Callable[[], BaseException],
+    every: int,
 ) -> None:
     """Both files are the old or the new ones; the next run ends, with the blocks that are saved or without."""
     monkeypatch.chdir(tmp_path)
@@ -236,5 +241,5 @@ def test_a_fault_at_every_operation_of_a_map(
         assert listing(tmp_path) == old
         if len(operations) <= moment:
             break
-        moment += 1
+        moment += every
     assert moment >= 18

@@ -238,7 +238,7 @@ def sampled_of(engine: Literal["exact", "smooth"], widths: Smoothing | None = No
     return SampledFit(target, fit, None, {**target.fixed, **fit.values})
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_both_engines_give_one_fit_within_the_certificate() -> None:
     (exact, own), (smooth, other) = fitted(), fitted("smooth")
     assert check_engine(sampled_of("exact")) == []

@@ -58,7 +58,9 @@ def test_the_papers_model_leaves_white_residuals() -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    "departure", [{"backward": 1.1}, {"k1_cubic": 2e7}], ids=["friction 10 % higher backward", "cubic term in k1"]
+    "departure",
+    [pytest.param({"backward": 1.1}, marks=pytest.mark.slow), {"k1_cubic": 2e7}],
+    ids=["friction 10 % higher backward", "cubic term in k1"],
 )
 def test_another_model_is_reported(departure: dict[str, float]) -> None:
     """The cubic term stiffens the rod by 3 % at 1.5 mm. The coloured noise of the second fit does not hide it."""
