@@ -252,7 +252,7 @@ def test_both_engines_give_one_fit_within_the_certificate() -> None:
     assert finding.facts["largest"] < 0.2
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_a_wide_smoothing_fails_its_certificate_and_moves_the_fit() -> None:
     """The negative control of the test above."""
     wide = Smoothing(velocity=1e-2)
