@@ -127,15 +127,14 @@ def _instrument_of(entry: Node, column: str) -> Node | None:
 
 
 def clock_of(entry: Node) -> Node | None:
-    """The clock of the instrument that read the times of an experiment."""
-    instrument = _instrument_of(entry, "time")
+    """The clock of the times of an experiment: its own, or that of the instrument that read them."""
+    instrument, own = _instrument_of(entry, "time"), entry["clock"] if "clock" in entry else None
     if instrument is None:
-        return None
-    if "clock" in entry or "clock" not in instrument:
-        key = entry["clock" if "clock" in entry else "time_instrument"]
+        return own
+    if own is not None or "clock" not in instrument:
         rule = "a clock is stated once, by the experiment or by the instrument of its times"
-        value, remedy = ("both", "remove clock") if "clock" in entry else ("none", "give the instrument a clock")
-        raise key.error(rule, value, remedy, of_key=True)
+        value, remedy = ("both", "remove clock") if own else ("none", "give the instrument a clock")
+        raise (own or entry["time_instrument"]).error(rule, value, remedy, of_key=True)
     return _error_of(instrument, "clock", "1")
 
 
@@ -415,12 +414,7 @@ class _Part:
     """Files side by side: the columns of one are found in any of them."""
 
     def __init__(self, exports: Sequence[Export]) -> None:
-        self.exports, self._rows = exports, list[int]()
-
-    @property
-    def rows(self) -> int:
-        """Number of rows of the columns found."""
-        return next(iter(self._rows), 0)
+        self.exports, self.rows = exports, 0  # the number of rows of the columns found
 
     def find(self, node: Node, header: Header, texts: bool = False) -> Found:
         """The column ``header``, stated at ``node`` of ``rig.toml``: its numbers, or its ``texts``."""
@@ -434,7 +428,7 @@ class _Part:
                     "write a number, or export the file as CSV",
                 )
             found.append(read(index))
-            self._rows.append(found[-1].size)
+            self.rows = self.rows or found[-1].size
             if found[-1].size != self.rows:
                 raise node.error(
                     f"columns must have equal lengths ({self.rows})",

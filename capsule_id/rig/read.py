@@ -396,8 +396,6 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
         encodings = {name: export.encoding for name, export in exports.items()}
         del exports
     drift = NO_DRIFT
-    if "clock" in entry:
-        raw, drift = on_reference(entry["clock"], raw)
     if (clock := clock_of(entry)) is not None:
         raw, drift = on_reference(clock, raw)
     if "reject" in entry:
