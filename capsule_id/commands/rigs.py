@@ -159,7 +159,9 @@ def fit_many(
     with client_of(scheduler) as client:
         fits = ((rig, partial(fitted_rig, rig, options, root, kinds)) for rig in rigs)
         progress(0, len(rigs), "rigs")
-        for done, (rig, fitted) in enumerate(fits if client is None else _on_cluster(client, rigs, options, root), start=1):
+        for done, (rig, fitted) in enumerate(
+            fits if client is None else _on_cluster(client, rigs, options, root), start=1
+        ):
             try:
                 files, line, clean = fitted()
                 stop_if_interrupted()

@@ -128,13 +128,13 @@ def _instrument_of(entry: Node, column: str) -> Node | None:
 
 def clock_of(entry: Node) -> Node | None:
     """The clock of the times of an experiment: its own, or that of the instrument that read them."""
-    instrument, own = _instrument_of(entry, "time"), entry["clock"] if "clock" in entry else None
+    instrument, own = _instrument_of(entry, "time"), "clock" in entry
     if instrument is None:
-        return own
-    if own is not None or "clock" not in instrument:
+        return entry["clock"] if own else None
+    if own or "clock" not in instrument:
         rule = "a clock is stated once, by the experiment or by the instrument of its times"
         value, remedy = ("both", "remove clock") if own else ("none", "give the instrument a clock")
-        raise (own or entry["time_instrument"]).error(rule, value, remedy, of_key=True)
+        raise entry["clock" if own else "time_instrument"].error(rule, value, remedy, of_key=True)
     return _error_of(instrument, "clock", "1")
 
 
