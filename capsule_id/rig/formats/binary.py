@@ -170,13 +170,11 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
                 raise InputError(
                     rule, f"{feature}, {name}", "write the readings into this file, uncompressed or by gzip"
                 )
-            if not isinstance(found, h5py.Dataset) or not found.size or found.ndim not in (1, 2):
-                continue
-            if found.dtype.kind not in "fiu":
-                continue
             # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
             if (
-                found.attrs.get("MATLAB_class") in (b"char", "char")
+                not isinstance(found, h5py.Dataset)
+                or not (found.size and found.ndim in (1, 2) and found.dtype.kind in "fiu")
+                or found.attrs.get("MATLAB_class") in (b"char", "char")
                 or name.startswith("#")
                 or "MATLAB_empty" in found.attrs
             ):
