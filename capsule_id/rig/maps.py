@@ -163,8 +163,8 @@ def without_stated_errors(entry: Node, column: Column, kind: KindRule) -> Column
         text = f"the instrument of {column.name} of {kind.name} {wanted}"
         raise place.error(text, shown(place.value), remedy, of_key=True)
     stated = {symbol: _error_of(node, symbol, si).quantity(si, ANY, has_sd=True) for symbol, si in units.items()}
-    instrument = Instrument(node["name"].value, rule.si, **stated)
-    gain, offset = instrument.errors.get("gain", NO_DRIFT), instrument.value("offset")
+    instrument = Instrument(node["name"].value, rule.si, stated)
+    gain, offset = stated.get("gain", NO_DRIFT), instrument.value("offset")
     if max(abs(gain.value), gain.sd) > LARGEST_GAIN:
         rule_of_gain = f"a gain is a relative error, at most {LARGEST_GAIN:g}"
         raise node["gain"].error(rule_of_gain, f"{gain.value:g} ± {gain.sd:g}", "write 0.01 for readings 1 % too large")

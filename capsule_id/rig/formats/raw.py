@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -104,7 +103,7 @@ def complete(path: Path, remedy: str) -> Iterator[None]:
 
 
 COMPRESSED = ".gz"
-#: Bytes of a block, and bytes that are decompressed at a time.
+#: Bytes of a block.
 BLOCK = 1 << 20
 WINDOWS = "Windows-1252"
 _CODECS = {"UTF-16": "utf-16", WINDOWS: "cp1252"}
@@ -177,12 +176,10 @@ def _bytes_of(content: bytes, path: Path) -> bytes:
     """The bytes of a text, decompressed."""
     if path.suffix.lower() != COMPRESSED:
         return content
-    found = list[bytes]()
     with complete(path, "compress it again by gzip"), gzip.open(io.BytesIO(content)) as file:
-        for block in iter(partial(file.read, BLOCK), b""):
-            found.append(block)
-            refuse_large(sum(map(len, found)), content, path)
-    return b"".join(found)
+        text = file.read(largest(content) + BLOCK)
+        refuse_large(len(text), content, path)
+    return text
 
 
 def _encoding(raw: bytes, path: Path) -> str:
