@@ -63,15 +63,17 @@ def prepare_store(out: Path, resume: bool) -> Path:
         raise InputError("the output must be a file", f"{out} is a folder", "choose another --out")
     check_parents(out.absolute(), "the folder of the output must be writable", "")
     if (out.parent / "parameters.json").exists():
-        rule, remedy = "the output must not lie in a result of fit-params", "choose another --out"
-        raise InputError(rule, f"{out.parent} is one", remedy, out)
+        raise InputError(
+            "the output must not lie in a result of fit-params", f"{out.parent} is one", "choose another --out", out
+        )
     store = out.with_name(out.name + PARTIAL)
     if resume and not (store / STORE_FILE).is_file():
         raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", store)
     if store.exists() and not resume:
         if not store.is_dir() or not all(_STORED.fullmatch(path.name) for path in store.iterdir()):
-            rule, remedy = "FILE.nc.partial must be unfinished work", "choose another --out"
-            raise InputError(rule, "it is something else", remedy, store)
+            raise InputError(
+                "FILE.nc.partial must be unfinished work", "it is something else", "choose another --out", store
+            )
         with refusing("FILE.nc.partial must be writable", "choose another --out", store):
             shutil.rmtree(store)
     return store
@@ -103,8 +105,9 @@ def client_of(scheduler: str | None) -> "Iterator[Client | None]":
         from dask import config
         from distributed import Client, LocalCluster
     except ImportError:
-        remedy = "install capsule-id[maps], or remove --scheduler"
-        raise InputError("--scheduler needs Dask", "distributed is not installed", remedy) from None
+        raise InputError(
+            "--scheduler needs Dask", "distributed is not installed", "install capsule-id[maps], or remove --scheduler"
+        ) from None
     # Each process computes with as many threads as there are cores; see physics/batches.py.
     processes = scheduler == "processes"
     local = {
@@ -122,9 +125,11 @@ def client_of(scheduler: str | None) -> "Iterator[Client | None]":
         try:
             client = Client(scheduler, timeout=CONNECT_TIMEOUT)
         except (OSError, ValueError) as error:
-            rule = "--scheduler is threads, processes or the address of a Dask scheduler"
-            value = f"{scheduler}: {type(error).__name__}"
-            raise InputError(rule, value, "start the scheduler, or check the address") from None
+            raise InputError(
+                "--scheduler is threads, processes or the address of a Dask scheduler",
+                f"{scheduler}: {type(error).__name__}",
+                "start the scheduler, or check the address",
+            ) from None
         yield opened.enter_context(client)
 
 
@@ -198,8 +203,9 @@ def run(args: argparse.Namespace) -> int:
     if rig is not None and args.result is None:
         args.result = Path("results") / rig.name
         if not (args.result / "parameters.json").is_file():
-            remedy = "run fit-params on it, or give --result"
-            raise InputError("DATA must have been fitted", f"no {args.result}", remedy)
+            raise InputError(
+                "DATA must have been fitted", f"no {args.result}", "run fit-params on it, or give --result"
+            )
     free = frozenset(_frequency_leaf(args) if axis.name == "f" else axis.name for axis in axes)
     # The posterior supplies k2.
     values = capsule_values(args, FIG_6_DEFAULTS, free | ({"k2"} if args.posterior is not None else set()))

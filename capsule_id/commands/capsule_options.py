@@ -85,8 +85,11 @@ def capsule_values(
         values[name] = value
     fit = args.result or getattr(args, "posterior", None)
     if args.spring is not None and (fit is None or values["G"] == math.inf):
-        remedy = "give --result DIR and --G X, in m, or remove --spring"
-        raise InputError("--spring needs the result that it is of, and a gap", "none", remedy)
+        raise InputError(
+            "--spring needs the result that it is of, and a gap",
+            "none",
+            "give --result DIR and --G X, in m, or remove --spring",
+        )
     return values
 
 
@@ -134,8 +137,12 @@ def fitted_values(directory: Path) -> dict[str, float]:
         law = str(saved.get("provenance", {}).get("friction", EQUATION_1))
     # The fitted values hold the free parameters of eq. (1) too.
     if law.split(",")[0] != EQUATION_1:
-        rule = "the commands compute with eq. (1), and --result must have been fitted with it"
-        raise InputError(rule, law, "call capsule_id.simulate(..., friction=law) in Python", file)
+        raise InputError(
+            "the commands compute with eq. (1), and --result must have been fitted with it",
+            law,
+            "call capsule_id.simulate(..., friction=law) in Python",
+            file,
+        )
     return values
 
 
@@ -153,7 +160,11 @@ def leaves_of(fitted: Mapping[str, Value], spring: str | None, file: str | Path 
         spring = next(iter(springs))
     if spring is not None:
         if spring not in springs:
-            remedy = f"choose from {', '.join(springs)}" if springs else "give --k2 instead"
-            raise InputError("--spring must be a fitted spring", spring, remedy, file)
+            raise InputError(
+                "--spring must be a fitted spring",
+                spring,
+                f"choose from {', '.join(springs)}" if springs else "give --k2 instead",
+                file,
+            )
         leaves["k2"] = springs[spring]
     return leaves

@@ -84,8 +84,11 @@ def run(args: argparse.Namespace) -> int:
     root = args.out or Path("results")
     if len(rigs) > 1:
         if args.resume or args.json:
-            rule, remedy = "--resume and --json are for one rig", "remove them; a repetition fits all rigs again"
-            raise InputError(rule, counted(len(rigs), "rig"), remedy)
+            raise InputError(
+                "--resume and --json are for one rig",
+                counted(len(rigs), "rig"),
+                "remove them; a repetition fits all rigs again",
+            )
         with Progress(not args.quiet, "rig") as progress:
             return fit_many(rigs, args, root, args.scheduler, kinds, progress)
     if args.scheduler is not None:

@@ -41,8 +41,12 @@ def check_output(directory: Path, options: Namespace) -> None:
     """
     check_directory(directory)
     if options.budget is None and (directory / "posterior.nc").exists():
-        rule, remedy = "--no-sample must not replace a result with a sample", "choose another --out, or move it away"
-        raise InputError(rule, "it holds posterior.nc", remedy, directory)
+        raise InputError(
+            "--no-sample must not replace a result with a sample",
+            "it holds posterior.nc",
+            "choose another --out, or move it away",
+            directory,
+        )
 
 
 def fingerprint_of(rig: Rig, options: Namespace, kinds: Registry) -> Mapping[str, object]:
@@ -145,8 +149,12 @@ def fit_many(
         rule, remedy = "rigs that are fitted together must have different names", "change one name in rig.toml"
         raise InputError(rule, twice[0], f"{remedy}, or name each folder once")
     if (root / "parameters.json").exists():
-        rule = "the output directory of several rigs must be none of a result"
-        raise InputError(rule, "it holds parameters.json", "choose another --out", root)
+        raise InputError(
+            "the output directory of several rigs must be none of a result",
+            "it holds parameters.json",
+            "choose another --out",
+            root,
+        )
     for rig in rigs:
         check_output(root / rig.name, options)
     prepare_jax(not options.no_cache)

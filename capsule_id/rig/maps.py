@@ -86,8 +86,9 @@ def _instruments(root: Node) -> dict[str, Node]:
     for index in range(len(entries.value)):
         node = entries[index]
         if not isinstance(node.value, dict) or "name" not in node:
-            remedy = 'write [[instrument]] and name = "..."'
-            raise node.error("an instrument must be a table with a name", shown(node.value), remedy)
+            raise node.error(
+                "an instrument must be a table with a name", shown(node.value), 'write [[instrument]] and name = "..."'
+            )
         node.refuse_unknown(INSTRUMENT_KEYS)
         if (name := node["name"].name()) in found:
             raise node["name"].error("instruments must have different names", shown(name), "rename one of them")
@@ -107,8 +108,12 @@ def refuse_idle_errors(root: Node, tables: Sequence[Table]) -> None:
         for key in node.value.keys() - {"name"}:
             if (name, key) not in read:
                 column = "time" if key == "clock" else "<column>"
-                remedy = f'write {column}_instrument = "{name}" in an experiment, or remove {key}'
-                raise node[key].error(f"the {key} of an instrument must act on a column", "none", remedy, of_key=True)
+                raise node[key].error(
+                    f"the {key} of an instrument must act on a column",
+                    "none",
+                    f'write {column}_instrument = "{name}" in an experiment, or remove {key}',
+                    of_key=True,
+                )
         if node.value.keys() == {"name"}:
             raise node.error("an instrument must have a gain, an offset or a clock", "none", "state one")
 
@@ -121,8 +126,11 @@ def _instrument_of(entry: Node, column: str) -> Node | None:
     known, name = _instruments(Node(entry.document, (), entry.document.data)), entry[key].text()
     if name not in known:
         near = closest(name, known)
-        remedy = f'write "{near}"' if near else f'add [[instrument]] with name = "{name}"'
-        raise entry[key].error("an experiment must name an instrument of rig.toml", shown(name), remedy)
+        raise entry[key].error(
+            "an experiment must name an instrument of rig.toml",
+            shown(name),
+            f'write "{near}"' if near else f'add [[instrument]] with name = "{name}"',
+        )
     return known[name]
 
 
@@ -159,9 +167,12 @@ def without_stated_errors(entry: Node, column: Column, kind: KindRule) -> Column
     units = {symbol: si for symbol, si in (("gain", "1"), ("offset", rule.si)) if symbol in known and symbol in node}
     if not units:
         wanted = f"must state {' or '.join(known)}" if known else "cannot be stated, only that of time"
-        remedy = f"{'state it, or ' if known else ''}remove {column.name}_instrument"
-        text = f"the instrument of {column.name} of {kind.name} {wanted}"
-        raise place.error(text, shown(place.value), remedy, of_key=True)
+        raise place.error(
+            f"the instrument of {column.name} of {kind.name} {wanted}",
+            shown(place.value),
+            f"{'state it, or ' if known else ''}remove {column.name}_instrument",
+            of_key=True,
+        )
     stated = {symbol: _error_of(node, symbol, si).quantity(si, ANY, has_sd=True) for symbol, si in units.items()}
     instrument = Instrument(node["name"].value, rule.si, stated)
     gain, offset = stated.get("gain", NO_DRIFT), instrument.value("offset")

@@ -67,8 +67,12 @@ def without_outliers(node: Node, raw: RawTable, times: Callable[[RawTable], np.n
         node.required(key, f"write {_REJECT_EXAMPLE}")
     stated = read_rules(node, _REJECT)
     if "time" not in raw.names:
-        remedy = "remove reject, and correct or delete the rows"
-        raise node.error("reject needs a record with times", " ".join(raw.names), remedy, of_key=True)
+        raise node.error(
+            "reject needs a record with times",
+            " ".join(raw.names),
+            "remove reject, and correct or delete the rows",
+            of_key=True,
+        )
     time = times(raw)
     step = median_step(time) if len(time) > 1 else np.inf
     half = stated["window"] / step / 2.0

@@ -83,8 +83,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     root, sha256 = _read_document(Path(folder))
     root.refuse_unknown(("rig", "model", "prior", "instrument", "experiment"))
     if "rig" not in root:
-        place = root.document.path, 1, 1
-        raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", *place)
+        raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", *root.document.path, 1, 1)
     head = root["rig"].table("[rig]")
     head.refuse_unknown(TABLE_KEYS["[rig]"], TABLE_KEYS)
     if "name" not in head:
@@ -197,8 +196,7 @@ def _read_experiments(
         with collecting(faults):
             table, sha256 = _read_experiment(entry.table("[[experiment]]"), kinds, ground, label)
             if table.label in [other.label for other in tables]:
-                place = next(key for key in ("label", "file", "files") if key in entry)
-                raise entry[place].error(
+                raise entry[next(key for key in ("label", "file", "files") if key in entry)].error(
                     "labels must be unique", shown(table.label), 'give one of them a label of its own: label = "..."'
                 )
             tables.append(table)
@@ -526,16 +524,17 @@ def _to_si(raw: RawTable, index: int, rule: ColumnRule) -> Column:
     _check_values(raw, index, rule, values)
     if rule.varies and np.ptp(values) == 0.0:
         one = len(values) == 1
-        text = (
-            (f"{name} must vary over the rows", "one row", "add rows")
+        raise raw.error(
+            0 if one else None,
+            name,
+            *(f"{name} must vary over the rows", "one row", "add rows")
             if one
             else (
                 f"{name} must not be constant",
                 f"{written[0]:g} {unit} in every row",
                 "check the sensor and the export",
-            )
+            ),
         )
-        raise raw.error(0 if one else None, name, *text)
     values.flags.writeable = False
     return Column(name, unit, 1.0 / factor, values)
 

@@ -395,9 +395,11 @@ def check_engine(root: Node, model: ModelChoices, tables: Sequence[Table[Any]]) 
     """
     integrated = any(not table.bench or getattr(table.settings, "forward", "") == "capsule" for table in tables)
     if model.engine == "smooth" and not integrated:
-        rule = 'engine = "smooth" needs an experiment that integrates eqs. (1) and (2): a run, or forward = "capsule"'
-        remedy = 'remove engine, or write forward = "capsule" for a decay or for pushes'
-        raise root["model"]["engine"].error(rule, "closed forms alone", remedy)
+        raise root["model"]["engine"].error(
+            'engine = "smooth" needs an experiment that integrates eqs. (1) and (2): a run, or forward = "capsule"',
+            "closed forms alone",
+            'remove engine, or write forward = "capsule" for a decay or for pushes',
+        )
 
 
 def read_confirmed(root: Node, tables: Sequence[Table[Any]], stated: Iterable[str]) -> tuple[str, ...]:

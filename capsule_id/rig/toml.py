@@ -123,8 +123,13 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
         """A float; one that a float64 cannot hold is refused where it first stands."""
         value = float(written.replace("_", ""))
         if value == 0.0 and re.search("[1-9]", re.split("[eE]", written)[0]):
-            rule, remedy = "a number must be one that float64 holds", "write 0: float64 begins at 5e-324"
-            raise InputError(rule, written, remedy, path, *_line_and_column(text, text.index(written)))
+            raise InputError(
+                "a number must be one that float64 holds",
+                written,
+                "write 0: float64 begins at 5e-324",
+                path,
+                *_line_and_column(text, text.index(written)),
+            )
         return value
 
     try:
@@ -144,8 +149,13 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
         ) from None
     deepest = max(scanner.keys, key=len, default=())
     if len(deepest) > DEEPEST_KEY:
-        place = _line_and_column(text, scanner.keys[deepest])
-        raise InputError("nesting must be shallow", f"a key of {len(deepest)} levels", _SHALLOW, path, *place)
+        raise InputError(
+            "nesting must be shallow",
+            f"a key of {len(deepest)} levels",
+            _SHALLOW,
+            path,
+            *_line_and_column(text, scanner.keys[deepest]),
+        )
     return TomlDocument(path, data, scanner.keys, scanner.values, text)
 
 

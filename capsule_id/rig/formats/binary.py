@@ -166,9 +166,10 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
             if isinstance(found, h5py.Dataset) and found.ndim > 2:
                 continue
             for feature in _unreadable(found):
-                rule = f"a {path.suffix} file must hold its readings itself, by filters of the HDF5 library"
                 raise InputError(
-                    rule, f"{feature}, {name}", "write the readings into this file, uncompressed or by gzip"
+                    f"a {path.suffix} file must hold its readings itself, by filters of the HDF5 library",
+                    f"{feature}, {name}",
+                    "write the readings into this file, uncompressed or by gzip",
                 )
             # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
             if (

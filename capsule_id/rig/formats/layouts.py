@@ -408,8 +408,9 @@ def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segmen
                 raise InputError("a segment must have rows", "none", _REMEDY, path, first, 1)
             segments.append(_Segment(keys, tuple(names), first, number))
             if names != [*segments[0].names]:
-                rule = "segments must have the same columns"
-                raise InputError(rule, shown_cell(" ".join(names)), _REMEDY, path, first, 1)
+                raise InputError(
+                    "segments must have the same columns", shown_cell(" ".join(names)), _REMEDY, path, first, 1
+                )
             keys, state = {}, "header"
         key, *cells = (cell.strip() for cell in line.split(separator))
         if state == "names":

@@ -67,8 +67,14 @@ def refuse_wide(columns: int, path: Path, line: int | None = None) -> None:
         Naming their number.
     """
     if columns > MOST_COLUMNS:
-        rule, remedy = f"a table must have at most {MOST_COLUMNS} columns", "export fewer channels, a row per sample"
-        raise InputError(rule, str(columns), remedy, path, line, line and 1)
+        raise InputError(
+            f"a table must have at most {MOST_COLUMNS} columns",
+            str(columns),
+            "export fewer channels, a row per sample",
+            path,
+            line,
+            line and 1,
+        )
 
 
 def require(package: str, path: Path) -> None:
@@ -143,8 +149,14 @@ class TextFile:
         while begin + LONGEST_LINE < len(self._text):
             end = self._text.rfind(b"\n", begin, begin + LONGEST_LINE + 1) + 1
             if not end:
-                rule, remedy = f"a line must have at most {LONGEST_LINE} bytes", "export a row per sample, in lines"
-                raise InputError(rule, "a longer one", remedy, self.path, self._text.count(b"\n", 0, begin) + 1, 1)
+                raise InputError(
+                    f"a line must have at most {LONGEST_LINE} bytes",
+                    "a longer one",
+                    "export a row per sample, in lines",
+                    self.path,
+                    self._text.count(b"\n", 0, begin) + 1,
+                    1,
+                )
             begin = end
 
     def blocks(self, first: int = 0) -> Iterator[tuple[int, bytes]]:
