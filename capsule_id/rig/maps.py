@@ -20,7 +20,7 @@ from capsule_id.rig.schema import (
     SettingRule,
     read_rules,
 )
-from capsule_id.rig.toml import ANY, Node, closest, is_count, is_number, shown
+from capsule_id.rig.toml import ANY, Node, is_count, is_number, remedy_for, shown
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si
 
 # clock: Puts the times of a record on the clock of another logger: ``clock = { offset = {...}, drift = {...} }``.
@@ -125,11 +125,10 @@ def _instrument_of(entry: Node, column: str) -> Node | None:
         return None
     known, name = _instruments(Node(entry.document, (), entry.document.data)), entry[key].text()
     if name not in known:
-        near = closest(name, known)
         raise entry[key].error(
             "an experiment must name an instrument of rig.toml",
             shown(name),
-            f'write "{near}"' if near else f'add [[instrument]] with name = "{name}"',
+            remedy_for(name, known, f'add [[instrument]] with name = "{name}"'),
         )
     return known[name]
 
@@ -177,12 +176,18 @@ def without_stated_errors(entry: Node, column: Column, kind: KindRule) -> Column
     instrument = Instrument(node["name"].value, rule.si, stated)
     gain, offset = stated.get("gain", NO_DRIFT), instrument.value("offset")
     if max(abs(gain.value), gain.sd) > LARGEST_GAIN:
-        rule_of_gain = f"a gain is a relative error, at most {LARGEST_GAIN:g}"
-        raise node["gain"].error(rule_of_gain, f"{gain.value:g} ± {gain.sd:g}", "write 0.01 for readings 1 % too large")
+        raise node["gain"].error(
+            f"a gain is a relative error, at most {LARGEST_GAIN:g}",
+            f"{gain.value:g} ± {gain.sd:g}",
+            "write 0.01 for readings 1 % too large",
+        )
     values = (column.values - offset) / (1.0 + gain.value)
     if not rule.domain.holds(values).all():
-        reached = f"{np.min(values) * column.to_display:g} {column.unit}"
-        raise node.error(f"{column.name} without its errors must {rule.domain.text}", reached, "correct value or unit")
+        raise node.error(
+            f"{column.name} without its errors must {rule.domain.text}",
+            f"{np.min(values) * column.to_display:g} {column.unit}",
+            "correct value or unit",
+        )
     values.flags.writeable = False
     sd, step = (size and size / (1.0 + gain.value) for size in (column.sd, column.resolution))
     return replace(column, values=values, sd=sd, resolution=step, instrument=instrument)
@@ -337,10 +342,11 @@ def _header(node: Node) -> Header:
         if value < 1:
             raise node.error("columns are counted from 1", str(value), "write 1 for the first column")
         return value
-    remedy = f'write {key} = 1 or {key} = "<header>"'
-    node.require(isinstance(value, str), "be a header or the number of a column", remedy)
-    rule, remedy = f"name the column that holds {node.path[-2]}", "write its header, or its number counted from 1"
-    node.require(value != UNKNOWN, rule, remedy)
+    node.require(
+        isinstance(value, str), "be a header or the number of a column", f'write {key} = 1 or {key} = "<header>"'
+    )
+    named = f"name the column that holds {node.path[-2]}"
+    node.require(value != UNKNOWN, named, "write its header, or its number counted from 1")
     return " ".join(node.text().split())
 
 
@@ -466,11 +472,10 @@ class _Part:
         found = [(export, column) for export in self.exports for column in self._column(node, export, header)]
         if not found:
             known = [name for export in self.exports for row in export.headers for name in row if name]
-            close = closest(str(header), known)
             raise node.error(
                 f"{node.key} must be a header of the file",
                 f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}",
-                f'write "{close}"' if close else "write the number of the column, counted from 1",
+                remedy_for(str(header), known, "write the number of the column, counted from 1"),
             )
         return found
 
@@ -478,14 +483,17 @@ class _Part:
         """Index of a column in one file; none if the file does not have the header."""
         if isinstance(header, int):
             if len(self.exports) > 1:
-                rule, remedy = "columns of files with different headers are named by their headers", '"<header>"'
-                raise node.error(rule, str(header), f"write {node.key} = {remedy}")
-            if header > export.width:
-                rule, remedy = (
-                    f"{node.key} must be one of the {export.width} columns of the file",
-                    f"1 to {export.width}",
+                raise node.error(
+                    "columns of files with different headers are named by their headers",
+                    str(header),
+                    f'write {node.key} = "<header>"',
                 )
-                raise node.error(rule, str(header), f"write a number from {remedy}")
+            if header > export.width:
+                raise node.error(
+                    f"{node.key} must be one of the {export.width} columns of the file",
+                    str(header),
+                    f"write a number from 1 to {export.width}",
+                )
             return [header - 1]
         found = ([index for index, name in enumerate(row) if name == header] for row in export.headers)
         numbers = next(filter(None, found), [])

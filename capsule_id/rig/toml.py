@@ -279,6 +279,12 @@ def closest(word: str, known: Collection[str]) -> str | None:
     return joined.get("".join(parts)) or (folded[tuple(near[0].split("_"))] if near else None)
 
 
+def remedy_for(word: str, known: Collection[str], otherwise: str, form: str = 'write "{}"') -> str:
+    """The remedy for a word that is not ``known``: the closest one in its ``form``, or ``otherwise``."""
+    close = closest(word, known)
+    return form.format(close) if close else otherwise
+
+
 def is_number(value: object) -> bool:
     """Whether a value of TOML is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
@@ -347,9 +353,8 @@ class Node:
         """Raise at the first key of a table that is not ``known``; ``elsewhere``: keys of other tables, by table."""
         for key in self.value:
             if key not in known:
-                close = closest(key, known)
                 table = next((name for name, keys in (elsewhere or {}).items() if key in keys), None)
-                remedy = f"move it to {table}" if table else f"write {close}" if close else "remove it"
+                remedy = f"move it to {table}" if table else remedy_for(key, known, "remove it", "write {}")
                 raise self[key].error("unknown key", shown(key), f"{remedy}; known: {' '.join(known)}", of_key=True)
 
     def table(self, example: str, known: Collection[str] = ()) -> "Node":
