@@ -21,6 +21,7 @@ from capsule_id.commands.capsule_options import (
     fitted_values,
     leaves_of,
     number,
+    whole_number,
 )
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import Progress, complain, saved, say
@@ -270,14 +271,14 @@ def _dataset(
     from capsule_id.report.write import read_draws
 
     settling = Settling(
-        dropped=_whole_number("dropped", args.dropped),
-        observed=_whole_number("observed", args.observed),
+        dropped=whole_number("dropped", args.dropped),
+        observed=whole_number("observed", args.observed),
         merge_contacts=number("merge-contacts", args.merge_contacts),
     )
     leaves: dict[str, Any] = dict(values)
     if args.posterior is not None:
         needs_k2 = args.k2 is None and all(axis.name != "k2" for axis in axes)
-        count, seed = _whole_number("draws", args.draws or "100"), _whole_number("seed", args.seed)
+        count, seed = whole_number("draws", args.draws or "100"), whole_number("seed", args.seed)
         drawn = read_draws(args.posterior, count, seed)
         draws = leaves_of(drawn, args.spring if needs_k2 else None, args.posterior)
         if "k2" not in draws and needs_k2:
@@ -295,7 +296,7 @@ def _dataset(
     if args.method == "rest":
         return sweep.diagram(p, e, over, grid, **plain)
     if args.method == "states":
-        starts = sweep.spread_starts(p, e, _whole_number("states", args.states), _whole_number("seed", args.seed))
+        starts = sweep.spread_starts(p, e, whole_number("states", args.states), whole_number("seed", args.seed))
         return sweep.diagram(p, e, over, grid, starts=starts, **plain)
     directions = ("forward", "backward") if args.method == "both" else (args.method,)
     return sweep.continuation(p, e, over, grid, directions=directions, **plain)
@@ -325,7 +326,7 @@ def _axis(prefix: str, name: str, begin: str, end: str, unit: str | None, points
     low, high = number(f"{prefix}from", begin), number(f"{prefix}to", end)
     if not low < high:
         raise InputError(f"--{prefix}from must be less than --{prefix}to", f"{low:g} and {high:g}", "swap them")
-    n = _whole_number(f"{prefix}points", points)
+    n = whole_number(f"{prefix}points", points)
     if not 2 <= n <= MOST_POINTS:
         raise InputError(f"--{prefix}points must lie between 2 and {MOST_POINTS}", points, "give e.g. 500")
     positive = SWEPT[name].sign == "positive" or name in ("Omega", "f")
@@ -373,13 +374,6 @@ def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
 def _frequency_leaf(args: argparse.Namespace) -> str:
     """The leaf that the frequency f stands for."""
     return "Omega" if args.drive == "harmonic" else "period"
-
-
-def _whole_number(name: str, text: str) -> int:
-    value = number(name, text)
-    if value != int(value) or value < 0:
-        raise InputError(f"--{name} must be a whole number", text, "give 0 or more")
-    return int(value)
 
 
 def _summary_text(data: "xr.Dataset", axes: Sequence[Axis], out: Path) -> str:

@@ -121,6 +121,20 @@ def number(name: str, text: str) -> float:
     return value
 
 
+def whole_number(name: str, text: str, least: int = 0) -> int:
+    """A whole number, ``least`` or more, from the option --name.
+
+    Raises
+    ------
+    InputError
+        If ``text`` is none.
+    """
+    value = number(name, text)
+    if value != int(value) or value < least:
+        raise InputError(f"--{name} must be a whole number of at least {least}", text, f"give {least} or more")
+    return int(value)
+
+
 def fitted_values(directory: Path) -> dict[str, float]:
     """Fitted values (maximum of the posterior) of DIR/parameters.json by name, SI.
 

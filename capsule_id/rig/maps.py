@@ -547,8 +547,6 @@ def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.n
     """The values of a column in its stated unit."""
     if source.minus is not None:
         values = values - part.find(node["minus"], source.minus)[0]
-    if source.scale == 1.0 and source.offset == 0.0:
-        return values
     with np.errstate(over="ignore"):
         return values * source.scale + source.offset
 
