@@ -83,7 +83,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     root, sha256 = _read_document(Path(folder))
     root.refuse_unknown(("rig", "model", "prior", "instrument", "experiment"))
     if "rig" not in root:
-        raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", *root.document.path, 1, 1)
+        raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", root.document.path, 1, 1)
     head = root["rig"].table("[rig]")
     head.refuse_unknown(TABLE_KEYS["[rig]"], TABLE_KEYS)
     if "name" not in head:
