@@ -186,8 +186,11 @@ class Fit(Result):
             values["k2"] = springs[spring]
         leaves = fields(CapsuleParameters)
         if missing := [leaf.name for leaf in leaves if leaf.default is MISSING and leaf.name not in values]:
-            rule, remedy = "simulate needs every parameter of the capsule", f"state given={{{missing[0]!r}: ...}}, SI"
-            raise InputError(rule, f"the fit has no {', '.join(missing)}", remedy)
+            raise InputError(
+                "simulate needs every parameter of the capsule",
+                f"the fit has no {', '.join(missing)}",
+                f"state given={{{missing[0]!r}: ...}}, SI",
+            )
         p = CapsuleParameters(**{leaf.name: values[leaf.name] for leaf in leaves if leaf.name in values})
         motion = simulate(p, drive, times)
         warn_of_far_gap(p.G, motion.x_rel)
@@ -269,8 +272,11 @@ def compare(a: Result, b: Result) -> pd.DataFrame:
     """
     for one in (a, b):
         if not isinstance(one, Result):
-            rule, remedy = "compare takes two results", "give results of fit, or load(DIR)"
-            raise InputError(rule, f"{type(one).__name__} {str(one)[:60]!r}", remedy)
+            raise InputError(
+                "compare takes two results",
+                f"{type(one).__name__} {str(one)[:60]!r}",
+                "give results of fit, or load(DIR)",
+            )
     names = [name for name in a.summary.index if name in b.summary.index]
     one, other = a.summary.loc[names], b.summary.loc[names]
     frame = pd.DataFrame({"unit": one["unit"]}, index=pd.Index(names, name="name"))
@@ -291,11 +297,11 @@ def _named(items: Sequence[Item], label: str | None, attribute: str = "label") -
         if label in (None, getattr(item, attribute)):
             return item
     names = ", ".join(getattr(item, attribute) for item in items)
-    rule, remedy = (
+    raise InputError(
         "the result must have this panel",
+        "there is none" if label is None else repr(label),
         f"choose from {names}" if names else "fit experiments that have it",
     )
-    raise InputError(rule, "there is none" if label is None else repr(label), remedy)
 
 
 def _new_axes(width: float, height: float, layout: Literal["constrained"] | None) -> Axes:

@@ -254,11 +254,10 @@ class Progress:
     def __init__(self, enabled: bool | None = None, unit: str = "draw") -> None:
         # A kernel's streams take no escape codes: there the bar is an output that is replaced.
         self._notebook = type(sys.stderr).__module__.startswith("ipykernel.")
-        self._display: Any = None
         self._terminal = sys.stderr.isatty() or self._notebook
         self._enabled, self._unit = self._terminal if enabled is None else enabled, unit
         self._stage, self._began, self._first, self._shown = "", 0.0, 0, 0.0
-        self._open = False
+        self._open = self._displayed = False
 
     def __enter__(self) -> "Progress":
         return self
@@ -299,11 +298,9 @@ class Progress:
     def _show(self, line: str) -> None:
         line = printable(line)
         if self._notebook:
-            bundle = {"text/plain": line}
-            if self._display is None:
-                self._display = import_module("IPython.display").display(bundle, raw=True, display_id=True)
-            else:
-                self._display.update(bundle, raw=True)
+            place: dict[str, Any] = {"display_id": f"progress {id(self)}", "update": self._displayed}
+            import_module("IPython.display").display({"text/plain": line}, raw=True, **place)
+            self._displayed = True
             return
         try:
             sys.stderr.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")

@@ -181,8 +181,12 @@ def _locked(directory: Path) -> Iterator[None]:
             try:
                 lock.acquire()
             except Timeout:
-                rule, remedy = "one run at a time writes to a directory", "wait, or choose another --out"
-                raise InputError(rule, "another run is active", remedy, partial) from None
+                raise InputError(
+                    "one run at a time writes to a directory",
+                    "another run is active",
+                    "wait, or choose another --out",
+                    partial,
+                ) from None
             except OSError as error:
                 if error.errno not in _WITHOUT_LOCKS:
                     raise
@@ -240,12 +244,15 @@ def _check_fingerprint(partial: Path, fingerprint: Mapping[str, object]) -> None
         saved = json.loads((partial / STATE).read_text(encoding="utf-8"))["fingerprint"]
         saved = {key: saved[key] for key in fingerprint}
     except (OSError, ValueError, KeyError, TypeError):
-        rule = "--resume needs the state that the interrupted run saved"
-        raise InputError(rule, "it is missing or damaged", remedy, partial / STATE) from None
+        raise InputError(
+            "--resume needs the state that the interrupted run saved",
+            "it is missing or damaged",
+            remedy,
+            partial / STATE,
+        ) from None
     for key, value in fingerprint.items():
         if saved[key] != json.loads(json.dumps(value)):
-            rule = f"--resume needs the same {key} as the interrupted run"
-            raise InputError(rule, f"{key} changed", remedy, partial)
+            raise InputError(f"--resume needs the same {key} as the interrupted run", f"{key} changed", remedy, partial)
 
 
 def publish(partial: Path, directory: Path) -> None:

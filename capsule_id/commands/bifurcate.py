@@ -21,6 +21,7 @@ from capsule_id.commands.capsule_options import (
     fitted_values,
     leaves_of,
     number,
+    whole_number,
 )
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import Progress, complain, saved, say
@@ -63,15 +64,17 @@ def prepare_store(out: Path, resume: bool) -> Path:
         raise InputError("the output must be a file", f"{out} is a folder", "choose another --out")
     check_parents(out.absolute(), "the folder of the output must be writable", "")
     if (out.parent / "parameters.json").exists():
-        rule, remedy = "the output must not lie in a result of fit-params", "choose another --out"
-        raise InputError(rule, f"{out.parent} is one", remedy, out)
+        raise InputError(
+            "the output must not lie in a result of fit-params", f"{out.parent} is one", "choose another --out", out
+        )
     store = out.with_name(out.name + PARTIAL)
     if resume and not (store / STORE_FILE).is_file():
         raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", store)
     if store.exists() and not resume:
         if not store.is_dir() or not all(_STORED.fullmatch(path.name) for path in store.iterdir()):
-            rule, remedy = "FILE.nc.partial must be unfinished work", "choose another --out"
-            raise InputError(rule, "it is something else", remedy, store)
+            raise InputError(
+                "FILE.nc.partial must be unfinished work", "it is something else", "choose another --out", store
+            )
         with refusing("FILE.nc.partial must be writable", "choose another --out", store):
             shutil.rmtree(store)
     return store
@@ -103,8 +106,9 @@ def client_of(scheduler: str | None) -> "Iterator[Client | None]":
         from dask import config
         from distributed import Client, LocalCluster
     except ImportError:
-        remedy = "install capsule-id[maps], or remove --scheduler"
-        raise InputError("--scheduler needs Dask", "distributed is not installed", remedy) from None
+        raise InputError(
+            "--scheduler needs Dask", "distributed is not installed", "install capsule-id[maps], or remove --scheduler"
+        ) from None
     # Each process computes with as many threads as there are cores; see physics/batches.py.
     processes = scheduler == "processes"
     local = {
@@ -122,9 +126,11 @@ def client_of(scheduler: str | None) -> "Iterator[Client | None]":
         try:
             client = Client(scheduler, timeout=CONNECT_TIMEOUT)
         except (OSError, ValueError) as error:
-            rule = "--scheduler is threads, processes or the address of a Dask scheduler"
-            value = f"{scheduler}: {type(error).__name__}"
-            raise InputError(rule, value, "start the scheduler, or check the address") from None
+            raise InputError(
+                "--scheduler is threads, processes or the address of a Dask scheduler",
+                f"{scheduler}: {type(error).__name__}",
+                "start the scheduler, or check the address",
+            ) from None
         yield opened.enter_context(client)
 
 
@@ -198,8 +204,9 @@ def run(args: argparse.Namespace) -> int:
     if rig is not None and args.result is None:
         args.result = Path("results") / rig.name
         if not (args.result / "parameters.json").is_file():
-            remedy = "run fit-params on it, or give --result"
-            raise InputError("DATA must have been fitted", f"no {args.result}", remedy)
+            raise InputError(
+                "DATA must have been fitted", f"no {args.result}", "run fit-params on it, or give --result"
+            )
     free = frozenset(_frequency_leaf(args) if axis.name == "f" else axis.name for axis in axes)
     # The posterior supplies k2.
     values = capsule_values(args, FIG_6_DEFAULTS, free | ({"k2"} if args.posterior is not None else set()))
@@ -264,14 +271,14 @@ def _dataset(
     from capsule_id.report.write import read_draws
 
     settling = Settling(
-        dropped=_whole_number("dropped", args.dropped),
-        observed=_whole_number("observed", args.observed),
+        dropped=whole_number("dropped", args.dropped),
+        observed=whole_number("observed", args.observed),
         merge_contacts=number("merge-contacts", args.merge_contacts),
     )
     leaves: dict[str, Any] = dict(values)
     if args.posterior is not None:
         needs_k2 = args.k2 is None and all(axis.name != "k2" for axis in axes)
-        count, seed = _whole_number("draws", args.draws or "100"), _whole_number("seed", args.seed)
+        count, seed = whole_number("draws", args.draws or "100"), whole_number("seed", args.seed)
         drawn = read_draws(args.posterior, count, seed)
         draws = leaves_of(drawn, args.spring if needs_k2 else None, args.posterior)
         if "k2" not in draws and needs_k2:
@@ -289,7 +296,7 @@ def _dataset(
     if args.method == "rest":
         return sweep.diagram(p, e, over, grid, **plain)
     if args.method == "states":
-        starts = sweep.spread_starts(p, e, _whole_number("states", args.states), _whole_number("seed", args.seed))
+        starts = sweep.spread_starts(p, e, whole_number("states", args.states), whole_number("seed", args.seed))
         return sweep.diagram(p, e, over, grid, starts=starts, **plain)
     directions = ("forward", "backward") if args.method == "both" else (args.method,)
     return sweep.continuation(p, e, over, grid, directions=directions, **plain)
@@ -319,7 +326,7 @@ def _axis(prefix: str, name: str, begin: str, end: str, unit: str | None, points
     low, high = number(f"{prefix}from", begin), number(f"{prefix}to", end)
     if not low < high:
         raise InputError(f"--{prefix}from must be less than --{prefix}to", f"{low:g} and {high:g}", "swap them")
-    n = _whole_number(f"{prefix}points", points)
+    n = whole_number(f"{prefix}points", points)
     if not 2 <= n <= MOST_POINTS:
         raise InputError(f"--{prefix}points must lie between 2 and {MOST_POINTS}", points, "give e.g. 500")
     positive = SWEPT[name].sign == "positive" or name in ("Omega", "f")
@@ -367,13 +374,6 @@ def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
 def _frequency_leaf(args: argparse.Namespace) -> str:
     """The leaf that the frequency f stands for."""
     return "Omega" if args.drive == "harmonic" else "period"
-
-
-def _whole_number(name: str, text: str) -> int:
-    value = number(name, text)
-    if value != int(value) or value < 0:
-        raise InputError(f"--{name} must be a whole number", text, "give 0 or more")
-    return int(value)
 
 
 def _summary_text(data: "xr.Dataset", axes: Sequence[Axis], out: Path) -> str:

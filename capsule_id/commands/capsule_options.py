@@ -84,8 +84,11 @@ def capsule_values(
         values[name] = value
     fit = args.result or getattr(args, "posterior", None)
     if args.spring is not None and (fit is None or values["G"] == math.inf):
-        remedy = "give --result DIR and --G X, in m, or remove --spring"
-        raise InputError("--spring needs the result that it is of, and a gap", "none", remedy)
+        raise InputError(
+            "--spring needs the result that it is of, and a gap",
+            "none",
+            "give --result DIR and --G X, in m, or remove --spring",
+        )
     return values
 
 
@@ -116,6 +119,20 @@ def number(name: str, text: str) -> float:
     return value
 
 
+def whole_number(name: str, text: str, least: int = 0) -> int:
+    """A whole number, ``least`` or more, from the option --name.
+
+    Raises
+    ------
+    InputError
+        If ``text`` is none.
+    """
+    value = number(name, text)
+    if value != int(value) or value < least:
+        raise InputError(f"--{name} must be a whole number of at least {least}", text, f"give {least} or more")
+    return int(value)
+
+
 def fitted_values(directory: Path) -> dict[str, float]:
     """Fitted values (maximum of the posterior) of DIR/parameters.json by name, SI.
 
@@ -132,8 +149,12 @@ def fitted_values(directory: Path) -> dict[str, float]:
         law = str(saved.get("provenance", {}).get("friction", EQUATION_1))
     # The fitted values hold the free parameters of eq. (1) too.
     if law.split(",")[0] != EQUATION_1:
-        rule = "the commands compute with eq. (1), and --result must have been fitted with it"
-        raise InputError(rule, law, "call capsule_id.simulate(..., friction=law) in Python", file)
+        raise InputError(
+            "the commands compute with eq. (1), and --result must have been fitted with it",
+            law,
+            "call capsule_id.simulate(..., friction=law) in Python",
+            file,
+        )
     return values
 
 
@@ -151,7 +172,11 @@ def leaves_of(fitted: Mapping[str, Value], spring: str | None, file: str | Path 
         spring = next(iter(springs))
     if spring is not None:
         if spring not in springs:
-            remedy = f"choose from {', '.join(springs)}" if springs else "give --k2 instead"
-            raise InputError("--spring must be a fitted spring", spring, remedy, file)
+            raise InputError(
+                "--spring must be a fitted spring",
+                spring,
+                f"choose from {', '.join(springs)}" if springs else "give --k2 instead",
+                file,
+            )
         leaves["k2"] = springs[spring]
     return leaves

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from capsule_id.commands import NO_CACHE, PATH
 from capsule_id.commands.compilation import prepare_jax
-from capsule_id.commands.rigs import Options, fit_many, fit_one
+from capsule_id.commands.rigs import fit_many, fit_one
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError, check_seed
 from capsule_id.experiments.kind import CHOICES, Registry, default_registry
@@ -78,21 +78,23 @@ def run(args: argparse.Namespace) -> int:
     rigs = [read_rig(folder, kinds) for folder in args.data]
     if args.compare is not None:
         return _compare(args, rigs, kinds)
-    budget = None if args.no_sample else args.max_steps
-    command = shlex.join(["fit-params", *sys.argv[1:]])
-    options = Options(args.seed, args.experiments, budget, args.ess, not args.no_cache, command)
+    args.budget = None if args.no_sample else args.max_steps
+    args.command = shlex.join(["fit-params", *sys.argv[1:]])
     root = args.out or Path("results")
     if len(rigs) > 1:
         if args.resume or args.json:
-            rule, remedy = "--resume and --json are for one rig", "remove them; a repetition fits all rigs again"
-            raise InputError(rule, counted(len(rigs), "rig"), remedy)
+            raise InputError(
+                "--resume and --json are for one rig",
+                counted(len(rigs), "rig"),
+                "remove them; a repetition fits all rigs again",
+            )
         with Progress(not args.quiet, "rig") as progress:
-            return fit_many(rigs, options, root, args.scheduler, kinds, progress)
+            return fit_many(rigs, args, root, args.scheduler, kinds, progress)
     if args.scheduler is not None:
         raise InputError("--scheduler is for several rigs", "one rig", "remove it, or name further folders")
     directory = args.out or root / rigs[0].name
     with Progress(not args.quiet) as progress:
-        return fit_one(rigs[0], options, directory, kinds, progress, resume=args.resume, as_json=args.json)
+        return fit_one(rigs[0], args, directory, kinds, progress)
 
 
 def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> int:

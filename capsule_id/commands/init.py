@@ -12,73 +12,14 @@ from capsule_id.importing import entry_of, read_file
 from capsule_id.output import replace_files
 from capsule_id.rig.toml import NAME_PATTERN
 
-# Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
-HEAD = """\
-#: A rig folder holds this file and the tables that it names.
-#: Lines that begin with `#:` explain. To use another line that begins with `#`, remove its `# `.
-#: A quantity is { value = ..., sd = ..., unit = "..." }; without sd the value is exact.
-#: A table is a CSV file: a header `name [unit]` per column (dimensionless: [1]), then a row of numbers per reading.
-#: Comma, semicolon or tab separates the cells; a decimal comma needs semicolon or tab.
-#: Files of another layout (also .lvm .tdms .mat .xlsx .npz .h5 .parquet) are read by a column map.
-#: Columns of the file that the map leaves out are ignored:
-#:   columns = { time = { from = "Time (s)", unit = "s" }, x_rel = { from = 3, unit = "mm", scale = -1, offset = 0.2 } }
-#:   from is a header, or a number counted from 1; the result is (from - minus) * scale + offset, in unit.
-#:   Without a time column: time = { rate = { value = 1000, unit = "Hz" } }. Further keys, where needed:
-#:   files = ["a.csv", "b.csv"] instead of file; data_from_line = 3; data_to_line = 90
-#:   decimal = ","; missing = ["--", "NaN"]; where = { tau = 30 }.
-#: Every experiment has four optional keys: label = "..." is its unique name (default: the file without suffix);
-#: <column>_sd states a reading error; <column>_resolution a reading step; <column>_instrument names an instrument.
-
-[rig]
-name = "@NAME@"
-#: true for synthetic data: every table and the report then show it
-# synthetic = false
-#: mass of the rod, needed for free vibrations, forced runs and sliding forces
-# m1 = { value = 0.110, sd = 0.0005, unit = "kg" }
-#: mass of the capsule, needed for forced runs, sliding forces and free vibrations with capsule = "free"
-# m2 = { value = 0.530, sd = 0.001, unit = "kg" }
-# g = { value = 9.81, unit = "m/s^2" }
-#: what has an unusual size and the right unit, as `capsule-id check` prints it: "m1", "LABEL.COLUMN", "LABEL.SETTING"
-# confirmed = ["m1"]
-#: slope of the track, +x_capsule uphill, and force that presses the capsule down besides its weight; exact without sd.
-#: An experiment may state its own; a tilt takes its own angle
-# slope = { value = 0, sd = 0.1, unit = "deg" }
-# N0 = { value = 0, unit = "N" }
-
-#: Choices of the model. friction: "stribeck" (eq. (1)) or "constant" (the same at every speed, no v_s).
-#: free: optional parameters that the fit samples: @OPTIONAL@.
-#: reaction: "ground", or "capsule" where the drive pushes the capsule back, as a coil inside it does.
-#: engine: "exact", or "smooth" (eqs. (1) and (2) smoothed; the report states the bias). For runs, and forward = "capsule".
-# [model]
-# friction = "stribeck"
-# free = ["ratio"]
-# reaction = "ground"
-# engine = "exact"
-
-#: Instruments: errors that all readings of one share, as its certificate states them. No sd holds what is not stated.
-#: The columns that it read name it: force_instrument = "cell", time_instrument = "logger" in their experiments.
-#:   [[instrument]]
-#:   name = "cell"
-#:   gain = { expanded = 1, k = 2, unit = "%" }          (or { half_width = 0.5, unit = "%" }, or { sd = 0.5, unit = "%" })
-#:   offset = { sd = 0.02, unit = "N" }                  (in the unit of its columns)
-#:   [[instrument]]
-#:   name = "logger"
-#:   clock = { value = 0, sd = 50, unit = "ppm" }
-
-#: Priors: knowledge from before the measurement. Default priors are broad.
-#: Log-normal, 95 % within median/factor to median*factor: @LOGNORMAL@.
-#: Half-normal, by scale: @HALFNORMAL@.
-#: Normal, by mean and sd: @NORMAL@.
-# [prior]
-# k1 = { median = 1500, factor = 3, unit = "N/m" }
-# tilt_sd = { scale = 1, unit = "deg" }
-"""
+#: The head of ``rig.toml``. Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
+HEAD = Path(__file__).with_name("template.toml")
 
 
 def template(kinds: Registry, name: str, entries: Sequence[str] | None = None) -> str:
     """The commented ``rig.toml`` of a rig called ``name``, with ``entries``, or a commented one for each of ``kinds``."""
     stated = [row for row in kinds.parameters.values() if row.prior_can_be_stated]
-    head = HEAD.replace("@NAME@", name)
+    head = HEAD.read_text(encoding="utf-8").replace("@NAME@", name)
     for kind in ("lognormal", "halfnormal", "normal"):
         rows = [row for row in stated if row.prior is not None and row.prior.kind == kind]
         words = ['"k2[<spring>]"' if row.symbol == "k2" else row.symbol for row in rows]

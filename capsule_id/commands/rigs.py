@@ -1,9 +1,13 @@
-"""Fits of one rig or of several: result directory, table, verdict; one after the other, or on a Dask cluster."""
+"""Fits of one rig or of several: result directory, table, verdict; one after the other, or on a Dask cluster.
+
+``options`` are those of ``fit-params`` as parsed, with ``budget`` (see ``capsule_id.api.fit``) and the ``command`` line.
+"""
 
 import time
+from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +16,7 @@ from capsule_id.commands.bifurcate import client_of
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import OnProgress, Progress, complain, one_line, save_traceback, saved, say, stop_if_interrupted
 from capsule_id.errors import InputError
-from capsule_id.experiments.kind import Choice, Registry, default_registry, make_experiments
+from capsule_id.experiments.kind import Registry, default_registry, make_experiments
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress, write_file
 from capsule_id.rig.model import Rig
 from capsule_id.views import counted
@@ -26,26 +30,7 @@ if TYPE_CHECKING:
 FAILED, NOT_CLEAN, CLEAN = 1, 3, 0
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of a fit.
-
-    Attributes
-    ----------
-    seed, experiments, budget, ess : see ``capsule_id.api.fit``
-    cached : whether compiled programs are kept in the user's cache
-    command : the command line, for the report
-    """
-
-    seed: int
-    experiments: Choice
-    budget: int | None
-    ess: float
-    cached: bool
-    command: str
-
-
-def check_output(directory: Path, options: Options) -> None:
+def check_output(directory: Path, options: Namespace) -> None:
     """Refuse a result directory that the fit must not replace.
 
     Raises
@@ -55,11 +40,15 @@ def check_output(directory: Path, options: Options) -> None:
     """
     check_directory(directory)
     if options.budget is None and (directory / "posterior.nc").exists():
-        rule, remedy = "--no-sample must not replace a result with a sample", "choose another --out, or move it away"
-        raise InputError(rule, "it holds posterior.nc", remedy, directory)
+        raise InputError(
+            "--no-sample must not replace a result with a sample",
+            "it holds posterior.nc",
+            "choose another --out, or move it away",
+            directory,
+        )
 
 
-def fingerprint_of(rig: Rig, options: Options, kinds: Registry) -> Mapping[str, object]:
+def fingerprint_of(rig: Rig, options: Namespace, kinds: Registry) -> Mapping[str, object]:
     """What an interrupted fit must have in common with the one that resumes it."""
     from capsule_id.inference.pipeline import PACKAGES, package_versions
 
@@ -75,7 +64,7 @@ def fingerprint_of(rig: Rig, options: Options, kinds: Registry) -> Mapping[str, 
 
 def make_fit(
     rig: Rig,
-    options: Options,
+    options: Namespace,
     kinds: Registry,
     store: Path | None = None,
     progress: OnProgress | None = None,
@@ -90,17 +79,8 @@ def make_fit(
     return replace(result, provenance=replace(result.provenance, made=made))
 
 
-def fit_one(
-    rig: Rig,
-    options: Options,
-    directory: Path,
-    kinds: Registry,
-    progress: Progress,
-    *,
-    resume: bool = False,
-    as_json: bool = False,
-) -> int:
-    """Fit, write ``directory``, print the table; 0 for a clean verdict, else 3. As many parameters as the command has.
+def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, progress: Progress) -> int:
+    """Fit, write ``directory``, print the table; 0 for a clean verdict, else 3.
 
     Raises
     ------
@@ -108,7 +88,7 @@ def fit_one(
         If the input is bad; then nothing is written.
     """
     check_output(directory, options)
-    prepare_jax(options.cached)
+    prepare_jax(not options.no_cache)
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.report.html import render
     from capsule_id.report.messages import messages_of
@@ -116,7 +96,7 @@ def fit_one(
 
     make_experiments(rig, options.experiments, kinds)
     messages_of(kinds)  # refuses conflicting messages before the fit
-    with work_in_progress(directory, fingerprint_of(rig, options, kinds), resume) as unfinished:
+    with work_in_progress(directory, fingerprint_of(rig, options, kinds), options.resume) as unfinished:
         saved.set()
 
         def show_point(first: "Fit") -> None:
@@ -131,7 +111,7 @@ def fit_one(
         publish(unfinished, directory)
     saved.clear()
     report = directory / "report.html"
-    if as_json:
+    if options.json:
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
     else:
         say(f"{result.table}\nreport: {report}\n{result.verdict}")
@@ -144,18 +124,12 @@ def fit_one(
 POLL = 0.1
 
 
-@dataclass(frozen=True)
-class FittedRig:
-    """A result as it comes from a worker: the content of its files by path, changes of the model, and the verdict."""
-
-    files: Mapping[str, bytes]
-    changes: str
-    verdict: str
-    clean: bool
+#: What comes from a worker: the content of the files of a result by path, the line about it, whether it is clean.
+FittedRig = tuple[Mapping[str, bytes], str, bool]
 
 
 def fit_many(
-    rigs: Sequence[Rig], options: Options, root: Path, scheduler: str | None, kinds: Registry, progress: OnProgress
+    rigs: Sequence[Rig], options: Namespace, root: Path, scheduler: str | None, kinds: Registry, progress: OnProgress
 ) -> int:
     """Fit every rig, write ``root``/<rig name> as soon as it is fitted, and print its verdict.
 
@@ -174,11 +148,15 @@ def fit_many(
         rule, remedy = "rigs that are fitted together must have different names", "change one name in rig.toml"
         raise InputError(rule, twice[0], f"{remedy}, or name each folder once")
     if (root / "parameters.json").exists():
-        rule = "the output directory of several rigs must be none of a result"
-        raise InputError(rule, "it holds parameters.json", "choose another --out", root)
+        raise InputError(
+            "the output directory of several rigs must be none of a result",
+            "it holds parameters.json",
+            "choose another --out",
+            root,
+        )
     for rig in rigs:
         check_output(root / rig.name, options)
-    prepare_jax(options.cached)
+    prepare_jax(not options.no_cache)
     from capsule_id.report.messages import messages_of
 
     messages_of(kinds)
@@ -186,20 +164,22 @@ def fit_many(
         make_experiments(rig, options.experiments, kinds)
     failures, unclean = list[str](), list[str]()
     with client_of(scheduler) as client:
-        fits = ((rig, partial(fitted_rig, rig, options, kinds)) for rig in rigs)
+        fits = ((rig, partial(fitted_rig, rig, options, root, kinds)) for rig in rigs)
         progress(0, len(rigs), "rigs")
-        for done, (rig, fitted) in enumerate(fits if client is None else _on_cluster(client, rigs, options), start=1):
+        for done, (rig, fitted) in enumerate(
+            fits if client is None else _on_cluster(client, rigs, options, root), start=1
+        ):
             try:
-                found = fitted()
+                files, line, clean = fitted()
                 stop_if_interrupted()
-                _write(found, root / rig.name, fingerprint_of(rig, options, kinds))
+                _write(files, root / rig.name, fingerprint_of(rig, options, kinds))
             except Exception as error:  # the other rigs are fitted all the same
                 stop_if_interrupted()
                 traceback = "" if isinstance(error, InputError | OSError) else f"; {save_traceback(error)}"
                 failures.append(f"{rig.name} ({one_line(error)}{traceback})")
             else:
-                say(f"{rig.name}: {found.verdict}; report: {root / rig.name / 'report.html'}{found.changes}")
-                unclean += [rig.name] * (not found.clean)
+                say(line)
+                unclean += [rig.name] * (not clean)
             progress(done, len(rigs), "rigs")
     parts = [f"verdict not clean: {', '.join(unclean)}"] * bool(unclean)
     parts += [f"{counted(len(failures), 'rig')} not fitted: {'; '.join(failures)}"] * bool(failures)
@@ -208,15 +188,15 @@ def fit_many(
     return FAILED if failures else NOT_CLEAN if unclean else CLEAN
 
 
-def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> FittedRig:
-    """Fit one rig; on a worker with the kinds installed there.
+def fitted_rig(rig: Rig, options: Namespace, root: Path, kinds: Registry | None = None) -> FittedRig:
+    """Fit one rig, which is written to ``root``/<rig name>; on a worker with the kinds installed there.
 
     Raises
     ------
     RuntimeError
         If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
     """
-    prepare_jax(options.cached)
+    prepare_jax(not options.no_cache)
     from capsule_id.report.columns import wrapped
     from capsule_id.report.write import result_files
 
@@ -225,14 +205,15 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
     except KeyboardInterrupt:
         raise RuntimeError("interrupted") from None
     changes = "".join(f"\n{line}" for line in wrapped(result.remarks))
-    return FittedRig(result_files(result), changes, result.verdict, result.clean)
+    line = f"{rig.name}: {result.verdict}; report: {root / rig.name / 'report.html'}{changes}"
+    return result_files(result), line, result.clean
 
 
 def _on_cluster(
-    client: "Client", rigs: Sequence[Rig], options: Options
+    client: "Client", rigs: Sequence[Rig], options: Namespace, root: Path
 ) -> Iterator[tuple[Rig, Callable[[], FittedRig]]]:
     """Results as they arrive. The scheduler gives the rig of a worker that dies to another one."""
-    tasks = {client.submit(fitted_rig, rig, options, pure=False): rig for rig in rigs}
+    tasks = {client.submit(fitted_rig, rig, options, root, pure=False): rig for rig in rigs}
     while tasks:
         # A wait for the next result would not notice an interruption.
         stop_if_interrupted()
@@ -241,9 +222,9 @@ def _on_cluster(
         time.sleep(POLL)
 
 
-def _write(found: FittedRig, directory: Path, fingerprint: Mapping[str, object]) -> None:
+def _write(files: Mapping[str, bytes], directory: Path, fingerprint: Mapping[str, object]) -> None:
     from capsule_id.report.write import write_result
 
     with work_in_progress(directory, fingerprint, resume=False) as unfinished:
-        write_result(found.files, unfinished)
+        write_result(files, unfinished)
         publish(unfinished, directory)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.commands import NO_CACHE, PATH
-from capsule_id.commands.capsule_options import capsule_and_drive, capsule_options, capsule_values, number
+from capsule_id.commands.capsule_options import capsule_and_drive, capsule_options, capsule_values, number, whole_number
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import complain, say
 from capsule_id.errors import InputError, refusing
@@ -110,9 +110,7 @@ def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]
     """End of the run in s and number of samples."""
     if args.periods is not None and args.duration is not None:
         raise InputError("a run has one length", "--periods and --duration", "remove one of them")
-    samples = number("samples", args.samples)
-    if samples != int(samples) or samples < 2:
-        raise InputError("--samples must be a whole number of at least 2", args.samples, "give e.g. 2000")
+    samples = whole_number("samples", args.samples, least=2)
     if args.duration is not None:
         end, text = number("duration", args.duration), f"--duration {args.duration}"
     elif period is not None:
@@ -122,7 +120,7 @@ def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]
         raise InputError("--periods needs Omega above 0", f"Omega = {float(args.Omega):g}", "give --duration")
     if not end > 0.0:
         raise InputError("the length must be positive", text, "give a positive number")
-    return end, int(samples)
+    return end, samples
 
 
 def _write(

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.inference.result import Posterior, Result
-from capsule_id.parameters import INSTRUMENT_WORDS, is_stated, symbol_of
+from capsule_id.parameters import INSTRUMENT_WORDS, Name, is_stated, symbol_of
 from capsule_id.views import Level, Trust, after_number, counted
 
 # typography: How numbers, units and parameter names are set: one rule each, for every table and figure.
@@ -28,9 +28,7 @@ _PREFIXES = dict(zip(range(-12, 10, 3), ("p", "n", "µ", "m", "", "k", "M", "G")
 # "1" has no prefix, "kg" has one already, and "m^2" with a prefix would mean the square of the prefixed unit.
 _PREFIXABLE = re.compile(r"(N|m|s|A|rad|Hz|J|W|V)(?![A-Za-z^0-9²³])")
 
-_NAME = re.compile(r"(?P<base>[A-Za-z]+?)(?:_?(?P<index>\d+|(?<=_)[A-Za-z0-9]+))?(?:\[(?P<label>.*)\])?")
-
-
+_SYMBOL = re.compile(r"([A-Za-z]+?)(?:_?(\d+|(?<=_)[A-Za-z0-9]+))?")
 # A longer name of a spring or an experiment would push the axis off the picture.
 _LONGEST_LABEL = 24
 
@@ -78,16 +76,14 @@ def symbol_parts(name: str) -> tuple[str, str, str]:
     ``k2[soft]`` -> ("k", "2", "soft"); ``mu`` -> ("μ", "", ""); ``v_s`` -> ("v", "s", "").
     Names that are words (``tilt_sd``) stay whole: ("tilt_sd", "", "").
     """
-    match = _NAME.fullmatch(name)
-    if match is None:
-        base, bracket, label = name.partition("[")
-        return base, "", label.removesuffix("]") if bracket else ""
-    base, index, label = match["base"], match["index"] or "", match["label"] or ""
+    symbol, label = Name.parse(name)
+    match = _SYMBOL.fullmatch(symbol)
+    base, index = match.groups("") if match else (symbol, "")
     try:
-        base = unicodedata.lookup(f"GREEK {'CAPITAL' if base[0].isupper() else 'SMALL'} LETTER {base}")
+        base = unicodedata.lookup(f"GREEK {'CAPITAL' if base[:1].isupper() else 'SMALL'} LETTER {base}")
     except KeyError:
         if len(base) > 1:
-            return name.partition("[")[0], "", label
+            return symbol, "", label
     return base, index, label
 
 

@@ -319,8 +319,11 @@ def messages_of(registry: Registry) -> Mapping[str, Message]:
     """
     for kind in registry.kinds:
         if own := sorted((FIT_MESSAGES.keys() | DATA_MESSAGES.keys()) & kind.messages.keys()):
-            rule = f"the kind {kind.name} must not declare messages of the whole fit"
-            raise InputError(rule, ", ".join(own), "rename these codes in the kind's messages")
+            raise InputError(
+                f"the kind {kind.name} must not declare messages of the whole fit",
+                ", ".join(own),
+                "rename these codes in the kind's messages",
+            )
     return {**FIT_MESSAGES, **DATA_MESSAGES, **registry.messages}
 
 

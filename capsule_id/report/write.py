@@ -474,7 +474,8 @@ def read_draws(path: Path, count: int, seed: int) -> dict[str, np.ndarray]:
         size = data.sizes["chain"] * data.sizes["draw"]
         columns = _members_of(data)
     if not 1 <= count <= size:
-        rule = "--draws must lie between 1 and the draws of the file"
-        raise InputError(rule, str(count), f"give at most {size}", path)
+        raise InputError(
+            "--draws must lie between 1 and the draws of the file", str(count), f"give at most {size}", path
+        )
     chosen = np.random.default_rng(seed).choice(size, count, replace=False)
     return {name: values.reshape(-1)[chosen] for name, values in columns.items()}

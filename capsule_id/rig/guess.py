@@ -20,7 +20,7 @@ from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
 from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile
 from capsule_id.rig.formats.text import is_row
 from capsule_id.rig.schema import KindRule
-from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
+from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale, symbol_named
 
 # headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
 
@@ -36,7 +36,7 @@ WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, wor
     "x_capsule": "capsule kapsel housing capsula gehause boitier carcasa",
     "x_base": "base shaker basis tisch",
     "acceleration": "acceleration acc accel accelerometer beschleunigung aceleracion accelerazione a beschl",
-    "velocity": "velocity speed v geschwindigkeit vitesse velocidad velocita vel geschw",
+    "velocity": "velocity speed v v0 geschwindigkeit vitesse velocidad velocita vel geschw",
     "current": "current strom stromstarke i courant corriente corrente intensite intensidad amps coil",
     "force": "force kraft f load friction weight pull fs fk fr fmax fstat fkin reibung fuerza forza "
     "frottement friccion rozamiento attrito traction traccion trazione last charge carga carico "
@@ -47,7 +47,6 @@ WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, wor
     "inclinaison inclinacion inclinazione pente pendiente pendenza ang phi θ α φ",
     "height": "height hoehe hohe h hauteur altura altezza rise elevation",
     "length": "length laenge lange l board longueur longitud lunghezza brett planche tabla tavola",
-    "speed": "speed velocity v v0 geschwindigkeit vitesse velocidad velocita vel geschw",
     "distance": "distance dist travel slide strecke weg x d s displacement disp distanz distancia distanza "
     "recorrido percorso parcours deplacement desplazamiento spostamento path spazio espacio",
     "deflection": "deflection displacement disp compression extension verformung weg x d s federweg auslenkung "
@@ -73,19 +72,11 @@ WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, wor
     "digits",
 }.items()}  # fmt: skip
 #: Names of the same quantity.
-SAME = {"acceleration_rod": "acceleration", "slope": "angle"}
+SAME = {"acceleration_rod": "acceleration", "slope": "angle", "speed": "velocity"}
 #: Fewest letters of a word that can end a compound, and shorter words that can.
 SHORTEST_HEAD, SHORT_HEADS = 5, ("weg", "zeit")
 #: Units of headers that state none: names that programs give to their columns, and a normal force, or one in N.
 UNITS_OF_NAMES: Mapping[str, str | None] = {"X_Value": "s", "F_N": None}
-#: Other ways to write a unit.
-SPELLINGS: Mapping[str, str] = {
-    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s", "sekunden": "s", "msec": "ms", "usec": "us",
-    "millimeter": "mm", "millimetre": "mm", "meter": "m", "metre": "m", "m/s2": "m/s^2", "m/s**2": "m/s^2",
-    "newton": "N", "amp": "A", "amps": "A", "ampere": "A", "degree": "deg", "degrees": "deg", "grad": "deg",
-    "seconde": "s", "secondes": "s", "segundos": "s", "secondi": "s", "meters": "m", "metres": "m", "metros": "m",
-    "metri": "m", "newtons": "N", "grados": "deg", "gradi": "deg", "degrés": "deg", "counts": "1", "count": "1", "-": "1",
-}  # fmt: skip
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*")
 _INSIDE = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*(\S.*)")
 _SEPARATED = re.compile(r"(.*?)(?:\s+/\s*|\s*,\s+|\s+in\s+)([^\s/,]\S*)")
@@ -93,8 +84,7 @@ _SEPARATED = re.compile(r"(.*?)(?:\s+/\s*|\s*,\s+|\s+in\s+)([^\s/,]\S*)")
 
 def unit_of(text: str, dimensions: Sequence[str]) -> str | None:
     """The unit that ``text`` writes, if it has one of the ``dimensions`` (SI units); else None."""
-    text = text.strip()
-    written = SPELLINGS.get(text.lower(), text)
+    written = symbol_named(text.strip())
     for si in dimensions:
         # A lone g beside an acceleration is standard gravity.
         candidate = "g_n" if written in ("g", "G") and si == "m/s^2" else written

@@ -20,7 +20,7 @@ from capsule_id.rig.schema import (
     SettingRule,
     read_rules,
 )
-from capsule_id.rig.toml import ANY, Node, closest, is_count, is_number, shown
+from capsule_id.rig.toml import ANY, Node, is_count, is_number, remedy_for, shown
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si
 
 # clock: Puts the times of a record on the clock of another logger: ``clock = { offset = {...}, drift = {...} }``.
@@ -86,8 +86,9 @@ def _instruments(root: Node) -> dict[str, Node]:
     for index in range(len(entries.value)):
         node = entries[index]
         if not isinstance(node.value, dict) or "name" not in node:
-            remedy = 'write [[instrument]] and name = "..."'
-            raise node.error("an instrument must be a table with a name", shown(node.value), remedy)
+            raise node.error(
+                "an instrument must be a table with a name", shown(node.value), 'write [[instrument]] and name = "..."'
+            )
         node.refuse_unknown(INSTRUMENT_KEYS)
         if (name := node["name"].name()) in found:
             raise node["name"].error("instruments must have different names", shown(name), "rename one of them")
@@ -107,8 +108,12 @@ def refuse_idle_errors(root: Node, tables: Sequence[Table]) -> None:
         for key in node.value.keys() - {"name"}:
             if (name, key) not in read:
                 column = "time" if key == "clock" else "<column>"
-                remedy = f'write {column}_instrument = "{name}" in an experiment, or remove {key}'
-                raise node[key].error(f"the {key} of an instrument must act on a column", "none", remedy, of_key=True)
+                raise node[key].error(
+                    f"the {key} of an instrument must act on a column",
+                    "none",
+                    f'write {column}_instrument = "{name}" in an experiment, or remove {key}',
+                    of_key=True,
+                )
         if node.value.keys() == {"name"}:
             raise node.error("an instrument must have a gain, an offset or a clock", "none", "state one")
 
@@ -120,22 +125,23 @@ def _instrument_of(entry: Node, column: str) -> Node | None:
         return None
     known, name = _instruments(Node(entry.document, (), entry.document.data)), entry[key].text()
     if name not in known:
-        near = closest(name, known)
-        remedy = f'write "{near}"' if near else f'add [[instrument]] with name = "{name}"'
-        raise entry[key].error("an experiment must name an instrument of rig.toml", shown(name), remedy)
+        raise entry[key].error(
+            "an experiment must name an instrument of rig.toml",
+            shown(name),
+            remedy_for(name, known, f'add [[instrument]] with name = "{name}"'),
+        )
     return known[name]
 
 
 def clock_of(entry: Node) -> Node | None:
-    """The clock of the instrument that read the times of an experiment."""
-    instrument = _instrument_of(entry, "time")
+    """The clock of the times of an experiment: its own, or that of the instrument that read them."""
+    instrument, own = _instrument_of(entry, "time"), "clock" in entry
     if instrument is None:
-        return None
-    if "clock" in entry or "clock" not in instrument:
-        key = entry["clock" if "clock" in entry else "time_instrument"]
+        return entry["clock"] if own else None
+    if own or "clock" not in instrument:
         rule = "a clock is stated once, by the experiment or by the instrument of its times"
-        value, remedy = ("both", "remove clock") if "clock" in entry else ("none", "give the instrument a clock")
-        raise key.error(rule, value, remedy, of_key=True)
+        value, remedy = ("both", "remove clock") if own else ("none", "give the instrument a clock")
+        raise entry["clock" if own else "time_instrument"].error(rule, value, remedy, of_key=True)
     return _error_of(instrument, "clock", "1")
 
 
@@ -160,19 +166,28 @@ def without_stated_errors(entry: Node, column: Column, kind: KindRule) -> Column
     units = {symbol: si for symbol, si in (("gain", "1"), ("offset", rule.si)) if symbol in known and symbol in node}
     if not units:
         wanted = f"must state {' or '.join(known)}" if known else "cannot be stated, only that of time"
-        remedy = f"{'state it, or ' if known else ''}remove {column.name}_instrument"
-        text = f"the instrument of {column.name} of {kind.name} {wanted}"
-        raise place.error(text, shown(place.value), remedy, of_key=True)
+        raise place.error(
+            f"the instrument of {column.name} of {kind.name} {wanted}",
+            shown(place.value),
+            f"{'state it, or ' if known else ''}remove {column.name}_instrument",
+            of_key=True,
+        )
     stated = {symbol: _error_of(node, symbol, si).quantity(si, ANY, has_sd=True) for symbol, si in units.items()}
-    instrument = Instrument(node["name"].value, rule.si, **stated)
-    gain, offset = instrument.errors.get("gain", NO_DRIFT), instrument.value("offset")
+    instrument = Instrument(node["name"].value, rule.si, stated)
+    gain, offset = stated.get("gain", NO_DRIFT), instrument.value("offset")
     if max(abs(gain.value), gain.sd) > LARGEST_GAIN:
-        rule_of_gain = f"a gain is a relative error, at most {LARGEST_GAIN:g}"
-        raise node["gain"].error(rule_of_gain, f"{gain.value:g} ± {gain.sd:g}", "write 0.01 for readings 1 % too large")
+        raise node["gain"].error(
+            f"a gain is a relative error, at most {LARGEST_GAIN:g}",
+            f"{gain.value:g} ± {gain.sd:g}",
+            "write 0.01 for readings 1 % too large",
+        )
     values = (column.values - offset) / (1.0 + gain.value)
     if not rule.domain.holds(values).all():
-        reached = f"{np.min(values) * column.to_display:g} {column.unit}"
-        raise node.error(f"{column.name} without its errors must {rule.domain.text}", reached, "correct value or unit")
+        raise node.error(
+            f"{column.name} without its errors must {rule.domain.text}",
+            f"{np.min(values) * column.to_display:g} {column.unit}",
+            "correct value or unit",
+        )
     values.flags.writeable = False
     sd, step = (size and size / (1.0 + gain.value) for size in (column.sd, column.resolution))
     return replace(column, values=values, sd=sd, resolution=step, instrument=instrument)
@@ -327,10 +342,11 @@ def _header(node: Node) -> Header:
         if value < 1:
             raise node.error("columns are counted from 1", str(value), "write 1 for the first column")
         return value
-    remedy = f'write {key} = 1 or {key} = "<header>"'
-    node.require(isinstance(value, str), "be a header or the number of a column", remedy)
-    rule, remedy = f"name the column that holds {node.path[-2]}", "write its header, or its number counted from 1"
-    node.require(value != UNKNOWN, rule, remedy)
+    node.require(
+        isinstance(value, str), "be a header or the number of a column", f'write {key} = 1 or {key} = "<header>"'
+    )
+    named = f"name the column that holds {node.path[-2]}"
+    node.require(value != UNKNOWN, named, "write its header, or its number counted from 1")
     return " ".join(node.text().split())
 
 
@@ -415,12 +431,7 @@ class _Part:
     """Files side by side: the columns of one are found in any of them."""
 
     def __init__(self, exports: Sequence[Export]) -> None:
-        self.exports, self._rows = exports, list[int]()
-
-    @property
-    def rows(self) -> int:
-        """Number of rows of the columns found."""
-        return next(iter(self._rows), 0)
+        self.exports, self.rows = exports, 0  # the number of rows of the columns found
 
     def find(self, node: Node, header: Header, texts: bool = False) -> Found:
         """The column ``header``, stated at ``node`` of ``rig.toml``: its numbers, or its ``texts``."""
@@ -434,7 +445,7 @@ class _Part:
                     "write a number, or export the file as CSV",
                 )
             found.append(read(index))
-            self._rows.append(found[-1].size)
+            self.rows = self.rows or found[-1].size
             if found[-1].size != self.rows:
                 raise node.error(
                     f"columns must have equal lengths ({self.rows})",
@@ -461,11 +472,10 @@ class _Part:
         found = [(export, column) for export in self.exports for column in self._column(node, export, header)]
         if not found:
             known = [name for export in self.exports for row in export.headers for name in row if name]
-            close = closest(str(header), known)
             raise node.error(
                 f"{node.key} must be a header of the file",
                 f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}",
-                f'write "{close}"' if close else "write the number of the column, counted from 1",
+                remedy_for(str(header), known, "write the number of the column, counted from 1"),
             )
         return found
 
@@ -473,14 +483,17 @@ class _Part:
         """Index of a column in one file; none if the file does not have the header."""
         if isinstance(header, int):
             if len(self.exports) > 1:
-                rule, remedy = "columns of files with different headers are named by their headers", '"<header>"'
-                raise node.error(rule, str(header), f"write {node.key} = {remedy}")
-            if header > export.width:
-                rule, remedy = (
-                    f"{node.key} must be one of the {export.width} columns of the file",
-                    f"1 to {export.width}",
+                raise node.error(
+                    "columns of files with different headers are named by their headers",
+                    str(header),
+                    f'write {node.key} = "<header>"',
                 )
-                raise node.error(rule, str(header), f"write a number from {remedy}")
+            if header > export.width:
+                raise node.error(
+                    f"{node.key} must be one of the {export.width} columns of the file",
+                    str(header),
+                    f"write a number from 1 to {export.width}",
+                )
             return [header - 1]
         found = ([index for index, name in enumerate(row) if name == header] for row in export.headers)
         numbers = next(filter(None, found), [])
@@ -534,8 +547,6 @@ def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.n
     """The values of a column in its stated unit."""
     if source.minus is not None:
         values = values - part.find(node["minus"], source.minus)[0]
-    if source.scale == 1.0 and source.offset == 0.0:
-        return values
     with np.errstate(over="ignore"):
         return values * source.scale + source.offset
 

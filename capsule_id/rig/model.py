@@ -49,21 +49,15 @@ class ModelChoices:
 
 @dataclass(frozen=True)
 class Instrument:
-    """What a column was read with: reading = (1 + gain) truth + offset, SI; None: not stated.
+    """What a column was read with: reading = (1 + gain) truth + offset, SI.
 
-    Columns of one instrument share its errors. ``unit`` is that of the offset. A clock states the ``drift`` of its table.
+    Columns of one instrument share its stated ``errors``, by symbol. ``unit`` is that of the offset. A clock states the
+    ``drift`` of its table.
     """
 
     name: str
     unit: str = "1"
-    gain: Quantity | None = None
-    offset: Quantity | None = None
-
-    @property
-    def errors(self) -> dict[str, Quantity]:
-        """The stated errors, by symbol."""
-        pairs = (("gain", self.gain), ("offset", self.offset))
-        return {symbol: stated for symbol, stated in pairs if stated is not None}
+    errors: Mapping[str, Quantity] = field(default_factory=dict)
 
     def value(self, symbol: str) -> float:
         """Stated value of an error, SI; 0 where it is not stated."""

@@ -67,8 +67,12 @@ def without_outliers(node: Node, raw: RawTable, times: Callable[[RawTable], np.n
         node.required(key, f"write {_REJECT_EXAMPLE}")
     stated = read_rules(node, _REJECT)
     if "time" not in raw.names:
-        remedy = "remove reject, and correct or delete the rows"
-        raise node.error("reject needs a record with times", " ".join(raw.names), remedy, of_key=True)
+        raise node.error(
+            "reject needs a record with times",
+            " ".join(raw.names),
+            "remove reject, and correct or delete the rows",
+            of_key=True,
+        )
     time = times(raw)
     step = median_step(time) if len(time) > 1 else np.inf
     half = stated["window"] / step / 2.0
@@ -144,8 +148,11 @@ def read_plateaus(entry: Node, kind: KindRule) -> Plateaus | None:
         )
     levels = node.table(_EXAMPLE, ("levels", "unit", "guard")).get("levels", None)
     stated = levels.value if isinstance(levels.value, list) and all(map(is_number, levels.value)) else []
-    rule, remedy = "be a list of numbers, two or more different ones", "write a level for each plateau, in order"
-    levels.require(len(set(stated)) > 1, rule, remedy)
+    levels.require(
+        len(set(stated)) > 1,
+        "be a list of numbers, two or more different ones",
+        "write a level for each plateau, in order",
+    )
     node.unit(kind.columns[names[0]].si)
     guard = DurationRule().read(node["guard"]) if "guard" in node else 0.0
     return Plateaus(names[0], np.array(stated, float), node.value["unit"], guard)

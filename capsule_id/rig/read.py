@@ -47,7 +47,7 @@ from capsule_id.rig.schema import (
     read_model,
     read_rules,
 )
-from capsule_id.rig.toml import LARGEST, NAME_PATTERN, SMALLEST, Node, closest, is_plausible, parse_toml, shown
+from capsule_id.rig.toml import LARGEST, NAME_PATTERN, SMALLEST, Node, is_plausible, parse_toml, remedy_for, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 from capsule_id.views import counted
 
@@ -83,8 +83,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     root, sha256 = _read_document(Path(folder))
     root.refuse_unknown(("rig", "model", "prior", "instrument", "experiment"))
     if "rig" not in root:
-        place = root.document.path, 1, 1
-        raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", *place)
+        raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", root.document.path, 1, 1)
     head = root["rig"].table("[rig]")
     head.refuse_unknown(TABLE_KEYS["[rig]"], TABLE_KEYS)
     if "name" not in head:
@@ -197,8 +196,7 @@ def _read_experiments(
         with collecting(faults):
             table, sha256 = _read_experiment(entry.table("[[experiment]]"), kinds, ground, label)
             if table.label in [other.label for other in tables]:
-                place = next(key for key in ("label", "file", "files") if key in entry)
-                raise entry[place].error(
+                raise entry[next(key for key in ("label", "file", "files") if key in entry)].error(
                     "labels must be unique", shown(table.label), 'give one of them a label of its own: label = "..."'
                 )
             tables.append(table)
@@ -228,9 +226,8 @@ def _read_experiment(
         raise entry.error("an experiment must have a kind", "none", 'add kind = "..."')
     word = entry["kind"].text()
     if word not in kinds:
-        close = closest(word, kinds)
         raise entry["kind"].error(
-            "unknown kind", shown(word), f'write "{close}"' if close else f"write one of {' '.join(kinds)}"
+            "unknown kind", shown(word), remedy_for(word, kinds, f"write one of {' '.join(kinds)}")
         )
     kind = kinds[word]
     rules, errors = kind.setting_rules, [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
@@ -341,10 +338,10 @@ def table_path(node: Node) -> Path:
     except (OSError, RuntimeError, ValueError) as error:
         raise node.error("file must be a readable file", f"{shown(name)} ({error})", remedy) from None
     beside = file.parent.glob("*") if inside and not exists else ()
-    near = closest(name, [p.relative_to(folder).as_posix() for p in beside if suffix_of(p) in EXPORTS])
+    tables = [p.relative_to(folder).as_posix() for p in beside if suffix_of(p) in EXPORTS]
     for holds, rule, cure in (
         (inside, "lie inside the rig folder, links followed", remedy),
-        (exists, "exist", f'write "{near}"' if near else "correct the name or add the file"),
+        (exists, "exist", remedy_for(name, tables, "correct the name or add the file")),
         (regular, "be a regular file", "name a table, not a folder or device"),
         (suffix_of(file) in EXPORTS, f"be a table of a known kind ({' '.join(EXPORTS)})", "export it as CSV"),
     ):
@@ -396,8 +393,6 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
         encodings = {name: export.encoding for name, export in exports.items()}
         del exports
     drift = NO_DRIFT
-    if "clock" in entry:
-        raw, drift = on_reference(entry["clock"], raw)
     if (clock := clock_of(entry)) is not None:
         raw, drift = on_reference(clock, raw)
     if "reject" in entry:
@@ -496,10 +491,9 @@ def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str
                     "a record against time",
                     f"read {sets} off the record, {_A_TRIAL}, and repeat the trial; plateaus reads steps of one record",
                 )
-            close = closest(name, kind.columns)
-            remedy = f"rename it to {close}" if close else "remove it"
-            known = " ".join(kind.columns)
-            raise error(name, f"unknown column in {kind.name}", shown(name), f"{remedy}; known: {known}")
+            remedy = remedy_for(name, kind.columns, "remove it", "rename it to {}")
+            remedy += f"; known: {' '.join(kind.columns)}"
+            raise error(name, f"unknown column in {kind.name}", shown(name), remedy)
     stated = {name for name in names if name not in (*kind.channels, *kind.optional)}
     if stated not in [set(columns) for columns in kind.sets]:
         wanted = ", or ".join(" and ".join(columns) for columns in kind.sets)
@@ -528,16 +522,17 @@ def _to_si(raw: RawTable, index: int, rule: ColumnRule) -> Column:
     _check_values(raw, index, rule, values)
     if rule.varies and np.ptp(values) == 0.0:
         one = len(values) == 1
-        text = (
-            (f"{name} must vary over the rows", "one row", "add rows")
+        raise raw.error(
+            0 if one else None,
+            name,
+            *(f"{name} must vary over the rows", "one row", "add rows")
             if one
             else (
                 f"{name} must not be constant",
                 f"{written[0]:g} {unit} in every row",
                 "check the sensor and the export",
-            )
+            ),
         )
-        raise raw.error(0 if one else None, name, *text)
     values.flags.writeable = False
     return Column(name, unit, 1.0 / factor, values)
 

@@ -21,7 +21,7 @@ from capsule_id.errors import InputError
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.model import ModelChoices, Quantity, S, Settings, Table
-from capsule_id.rig.toml import ANY, INCLINE, POSITIVE, Domain, Node, closest, is_count, shown
+from capsule_id.rig.toml import ANY, INCLINE, POSITIVE, Domain, Node, is_count, remedy_for, shown
 from capsule_id.views import counted
 
 # schema: Types for the columns, settings and rules of a kind of experiment. The reader uses no other type of a kind.
@@ -351,8 +351,11 @@ def read_words(node: Node, known: Sequence[str], rule: str, remedy: str) -> list
     """
     for word in node.value:
         if word not in known:
-            near = closest(word, known) if isinstance(word, str) else None
-            raise node.error(f"{node.key} must name {rule}", shown(word), f"write {near}" if near else remedy)
+            raise node.error(
+                f"{node.key} must name {rule}",
+                shown(word),
+                remedy_for(word if isinstance(word, str) else "", known, remedy, "write {}"),
+            )
     return node.value
 
 
@@ -395,9 +398,11 @@ def check_engine(root: Node, model: ModelChoices, tables: Sequence[Table[Any]]) 
     """
     integrated = any(not table.bench or getattr(table.settings, "forward", "") == "capsule" for table in tables)
     if model.engine == "smooth" and not integrated:
-        rule = 'engine = "smooth" needs an experiment that integrates eqs. (1) and (2): a run, or forward = "capsule"'
-        remedy = 'remove engine, or write forward = "capsule" for a decay or for pushes'
-        raise root["model"]["engine"].error(rule, "closed forms alone", remedy)
+        raise root["model"]["engine"].error(
+            'engine = "smooth" needs an experiment that integrates eqs. (1) and (2): a run, or forward = "capsule"',
+            "closed forms alone",
+            'remove engine, or write forward = "capsule" for a decay or for pushes',
+        )
 
 
 def read_confirmed(root: Node, tables: Sequence[Table[Any]], stated: Iterable[str]) -> tuple[str, ...]:

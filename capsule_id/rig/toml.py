@@ -123,8 +123,13 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
         """A float; one that a float64 cannot hold is refused where it first stands."""
         value = float(written.replace("_", ""))
         if value == 0.0 and re.search("[1-9]", re.split("[eE]", written)[0]):
-            rule, remedy = "a number must be one that float64 holds", "write 0: float64 begins at 5e-324"
-            raise InputError(rule, written, remedy, path, *_line_and_column(text, text.index(written)))
+            raise InputError(
+                "a number must be one that float64 holds",
+                written,
+                "write 0: float64 begins at 5e-324",
+                path,
+                *_line_and_column(text, text.index(written)),
+            )
         return value
 
     try:
@@ -144,8 +149,13 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
         ) from None
     deepest = max(scanner.keys, key=len, default=())
     if len(deepest) > DEEPEST_KEY:
-        place = _line_and_column(text, scanner.keys[deepest])
-        raise InputError("nesting must be shallow", f"a key of {len(deepest)} levels", _SHALLOW, path, *place)
+        raise InputError(
+            "nesting must be shallow",
+            f"a key of {len(deepest)} levels",
+            _SHALLOW,
+            path,
+            *_line_and_column(text, scanner.keys[deepest]),
+        )
     return TomlDocument(path, data, scanner.keys, scanner.values, text)
 
 
@@ -269,6 +279,12 @@ def closest(word: str, known: Collection[str]) -> str | None:
     return joined.get("".join(parts)) or (folded[tuple(near[0].split("_"))] if near else None)
 
 
+def remedy_for(word: str, known: Collection[str], otherwise: str, form: str = 'write "{}"') -> str:
+    """The remedy for a word that is not ``known``: the closest one in its ``form``, or ``otherwise``."""
+    close = closest(word, known)
+    return form.format(close) if close else otherwise
+
+
 def is_number(value: object) -> bool:
     """Whether a value of TOML is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
@@ -337,9 +353,8 @@ class Node:
         """Raise at the first key of a table that is not ``known``; ``elsewhere``: keys of other tables, by table."""
         for key in self.value:
             if key not in known:
-                close = closest(key, known)
                 table = next((name for name, keys in (elsewhere or {}).items() if key in keys), None)
-                remedy = f"move it to {table}" if table else f"write {close}" if close else "remove it"
+                remedy = f"move it to {table}" if table else remedy_for(key, known, "remove it", "write {}")
                 raise self[key].error("unknown key", shown(key), f"{remedy}; known: {' '.join(known)}", of_key=True)
 
     def table(self, example: str, known: Collection[str] = ()) -> "Node":

@@ -55,14 +55,16 @@ _DEFINITIONS = {
 }
 # Other ways to write the same symbol.
 _SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "⋅": "·", "%": "percent"})
-# Other names of symbols, in lower case; an s at their end is left out.
+# Other names of symbols and units, in lower case; an s at their end is left out.
 _NAMES = {
     "sec": "s", "second": "s", "msec": "ms", "millisecond": "ms", "usec": "us", "microsecond": "us", "nsec": "ns",
     "nanosecond": "ns", "minute": "min", "meter": "m", "metre": "m", "millimeter": "mm", "millimetre": "mm",
     "micron": "um", "micrometer": "um", "micrometre": "um", "centimeter": "cm", "centimetre": "cm", "inch": "in",
     "inche": "in", "gram": "g", "gramme": "g", "kilogram": "kg", "kilo": "kg", "pound": "lb", "lb": "lb",
     "newton": "N", "amp": "A", "ampere": "A", "degree": "deg", "deg": "deg", "radian": "rad", "rad": "rad",
-    "hertz": "Hz", "volt": "V", "millivolt": "mV",
+    "hertz": "Hz", "volt": "V", "millivolt": "mV", "sek": "s", "sekunden": "s", "seconde": "s", "segundo": "s",
+    "secondi": "s", "metro": "m", "metri": "m", "grad": "deg", "grado": "deg", "gradi": "deg", "degré": "deg",
+    "m/s2": "m/s^2", "m/s**2": "m/s^2", "count": "1", "-": "1",
 }  # fmt: skip
 _SYMBOL = re.compile("g_n|[A-Za-z]+")
 _FACTOR = r"(?:(?:g_n|[A-Za-z]+)(?:\^-?[1-4]|⁻?[¹²³⁴])?|1)"
@@ -137,9 +139,14 @@ def factor_to_si(unit: str, si: str) -> float:
     return float(factor)
 
 
+def symbol_named(text: str) -> str:
+    """The symbol that another name means, such as ``seconds``; ``text`` itself where it is none."""
+    return _NAMES.get(text.lower().removesuffix("s"), text)
+
+
 def _known(symbol: str) -> str:
     """The symbol that another name, or the other case, means; ``symbol`` itself where it is none. M is the mega of MN."""
-    name = _NAMES.get(symbol.lower().removesuffix("s"), symbol)
+    name = symbol_named(symbol)
     same = [each for each in _DEFINITIONS if each.lower() == symbol.lower() and symbol[1:] and symbol[0] != "M"]
     return symbol if symbol in _DEFINITIONS else same[0] if name == symbol and len(same) == 1 else name
 

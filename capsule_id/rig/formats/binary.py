@@ -4,11 +4,9 @@ import io
 import json
 import logging
 import os
-import struct
 import subprocess
 import sys
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -24,7 +22,6 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.layouts import read_text
 from capsule_id.rig.formats.raw import (
-    LARGEST_CONTENT,
     READING,
     SPREAD,
     Export,
@@ -35,7 +32,6 @@ from capsule_id.rig.formats.raw import (
     refuse_large,
     require,
 )
-from capsule_id.views import counted
 
 # arrays: Formats of named arrays: an adapter for each gives every array of real numbers with its name and unit.
 
@@ -72,22 +68,23 @@ def _read_arrays(
     return export_of_arrays(arrays, path, layout, units)
 
 
-# hdf5: Reads HDF5 files, among them MATLAB files of version 7.3: every real numeric data set is a column, or a matrix.
+# process: Reads HDF5 and MATLAB files by h5py and SciPy in a process of its own: every real numeric data set or variable is
+# a column, of a matrix every column; so is a field of a struct.
 #
-# h5py reads them in a process of its own: from some damaged files its C library never returns, others end the process.
-# The file is given as bytes, so that no other file is read.
+# From some damaged files their C libraries never return, others end the process. The file is given as bytes, so that no
+# other file is read.
 
 
-#: Longest time to read a small HDF5 file, s of the processor, bytes that a larger one has for each further second, and
+#: Longest time to read a small file, s of the processor, bytes that a larger one has for each further second, and
 #: memory of the process beyond that of the file, bytes.
 LONGEST_READING, BYTES_PER_SECOND, SPARE_MEMORY = 8, 1 << 25, 1 << 29
 #: Time beside that, s, in which a busy machine starts the process.
 LONGEST_START = 60
 
 
-def _data_sets(content: bytes, path: Path) -> Named:
-    """The data sets of an HDF5 file; their names are paths such as ``group/x``."""
-    command = [sys.executable, "-P", "-c", f"from {__name__} import serve_hdf5; serve_hdf5()", path.name]
+def _in_process(content: bytes, path: Path) -> Named:
+    """The arrays of an HDF5 file, whose names are paths such as ``group/x``, or of a MATLAB file."""
+    command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()", path.name]
     own = str(Path(__file__).parents[3])  # the package may be imported from the working folder
     paths = os.pathsep.join(dict.fromkeys([*filter(None, sys.path), own]))
     threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # the memory of their stacks counts
@@ -115,16 +112,16 @@ def _data_sets(content: bytes, path: Path) -> Named:
         if len(values) != size:
             break
         yield name, np.frombuffer(values, dtype).reshape(shape), unit
-    raise ValueError(f"reading it takes more than {_longest(content)} s, or ends the HDF5 library")
+    raise ValueError(f"reading it takes more than {_longest(content)} s, or ends the library that reads it")
 
 
 def _longest(content: bytes) -> int:
-    """Longest time to read an HDF5 file, s."""
+    """Longest time to read a file, s."""
     return LONGEST_READING + len(content) // BYTES_PER_SECOND
 
 
-def serve_hdf5() -> None:
-    """Read the HDF5 file of standard input; write a line of JSON and the bytes of each data set to standard output."""
+def serve() -> None:
+    """Read the file of standard input; write a line of JSON and the bytes of each array to standard output."""
     content, out, path = sys.stdin.buffer.read(), sys.stdout.buffer, Path(sys.argv[1])
     fault: Any = None
     try:
@@ -135,8 +132,11 @@ def serve_hdf5() -> None:
             for kind, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, longest)):
                 with suppress(ValueError, OSError):  # a lower limit holds already, or the system has none of this kind
                     resource.setrlimit(kind, (limit, limit))
-        with complete(path, "export it again"):
-            for name, array, unit in _read_data_sets(content, path):
+        read, remedy = _read_data_sets, "export it again"
+        if path.suffix.lower() == ".mat" and not content.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF")):
+            read, remedy = _read_variables, "save it again by save(..., '-v7')"
+        with complete(path, remedy):
+            for name, array, unit in read(content, path):
                 out.write(json.dumps([name, array.dtype.str, array.shape, unit, None]).encode() + b"\n")
                 out.write(array.data)
     except InputError as error:
@@ -166,17 +166,16 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
             if isinstance(found, h5py.Dataset) and found.ndim > 2:
                 continue
             for feature in _unreadable(found):
-                rule = f"a {path.suffix} file must hold its readings itself, by filters of the HDF5 library"
                 raise InputError(
-                    rule, f"{feature}, {name}", "write the readings into this file, uncompressed or by gzip"
+                    f"a {path.suffix} file must hold its readings itself, by filters of the HDF5 library",
+                    f"{feature}, {name}",
+                    "write the readings into this file, uncompressed or by gzip",
                 )
-            if not isinstance(found, h5py.Dataset) or not found.size or found.ndim not in (1, 2):
-                continue
-            if found.dtype.kind not in "fiu":
-                continue
             # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
             if (
-                found.attrs.get("MATLAB_class") in (b"char", "char")
+                not isinstance(found, h5py.Dataset)
+                or not (found.size and found.ndim in (1, 2) and found.dtype.kind in "fiu")
+                or found.attrs.get("MATLAB_class") in (b"char", "char")
                 or name.startswith("#")
                 or "MATLAB_empty" in found.attrs
             ):
@@ -220,124 +219,31 @@ def _written(found: Any) -> np.ndarray:
     return np.where(written, array, np.nan)
 
 
-read_hdf5 = partial(_read_arrays, _data_sets, "export it again", "")
+def _read_variables(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarray, str]]:
+    """The real numeric variables of a MATLAB file up to version 7, and the fields of structs such as ``run.time``.
 
-
-# mat: Reads MATLAB files: every real numeric variable is a column, of a matrix every column; so is a field of a struct.
-#
-# Files of version 7.3 are HDF5 files. The format of versions 5 to 7 is that of "MAT-File Format", The MathWorks,
-# level 5. SciPy's reader ends the process by a segmentation fault on files with one changed byte, so this one
-# checks every tag; the tests compare the two on intact files.
-
-
-_MATRIX, _COMPRESSED = 14, 15  # types of data elements
-_STRUCT = 2  # class of arrays with fields
-_DEEPEST = 16  # struct in a struct
-_NUMERIC_CLASSES = range(6, 16)  # of arrays: double, single, and integers of 8 to 64 bits
-_COMPLEX = 0x0800  # flag of an array
-#: NumPy's types by the number of the format.
-_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-
-
-def read_mat(content: bytes, path: Path, layout: Layout) -> Export:
-    """Read the vectors of a MATLAB file by name; column 2 of a matrix ``data`` is called ``data(:,2)``.
-
-    Fields of structs have names such as ``run.time``, or ``run(2).time`` in an array of structs.
-
-    Parameters
-    ----------
-    content : the bytes of the file
-    path : its name, for error lines
-    layout : ``missing`` may hold "NaN"; the rest does not apply
-
-    Raises
-    ------
-    InputError
-        If it is no MATLAB file, is damaged, or has no numeric variable.
+    In an array of structs the second one is ``run(2)``. Files of version 7.3 are HDF5 files.
     """
-    hdf5 = content.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF"))
-    return (read_hdf5 if hdf5 else _read_mat_5)(content, path, layout)
+    from scipy.io import loadmat
+
+    ahead = list(loadmat(io.BytesIO(content)).items())
+    while ahead:
+        name, value = ahead.pop(0)
+        if type(value) is not np.ndarray or name.startswith("__"):  # a sparse matrix, an object, the header
+            continue
+        if fields := value.dtype.names:
+            structs = value.ravel(order="F")
+            places = [f"({k + 1})" for k in range(len(structs))] if len(structs) > 1 else [""]
+            ahead[:0] = [
+                (f"{name}{place}.{field}", one[field])
+                for place, one in zip(places, structs, strict=False)
+                for field in fields
+            ]
+        elif value.dtype.kind in "fiu" and value.ndim == 2 and value.size:
+            yield name, np.ascontiguousarray(value), ""
 
 
-def _variables(content: bytes, path: Path) -> Named:
-    """The real numeric arrays; other variables are left out."""
-    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
-    if order is None:
-        raise ValueError("no header of a MATLAB file")
-    unpacked = 0
-    for kind, element in _elements(content[128:], order):
-        if kind == _COMPRESSED:
-            data = zlib.decompressobj().decompress(element, LARGEST_CONTENT >> 2)
-            unpacked += len(data)
-            refuse_large(unpacked // 2, content, path)
-            kind, element = next(_elements(data, order), (0, b""))
-        for name, values in _arrays(kind, element, order):
-            yield name, values, ""
-
-
-_read_mat_5 = partial(_read_arrays, _variables, "save it again by save(..., '-v7')", "")
-
-
-def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Type and bytes of every data element."""
-    position = 0
-    while position < len(content):
-        kind, size = struct.unpack_from(order + "II", content, position)
-        start = position + 8
-        if kind >> 16:  # a small element: type, size and at most 4 bytes in the place of the tag
-            kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
-            position += 8
-        else:
-            position = start + size + (-size % 8 if kind != _COMPRESSED else 0)
-        element = content[start : start + size]
-        if len(element) != size:
-            raise ValueError("an element is longer than the file")
-        yield kind, element
-
-
-def _arrays(
-    kind: int, element: bytes, order: str, own: str | None = None, depth: int = 0
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and values of the real numeric arrays of an element: one, none, or those of the fields of a struct.
-
-    ``own`` is the name of a field, which its element does not hold.
-    """
-    if kind != _MATRIX or not element:  # an empty field
-        return
-    parts = _elements(element, order)
-    (flags,) = struct.unpack_from(order + "I", next(parts, (0, b""))[1])
-    (_, sizes), (_, stated) = (next(parts, (0, b"")) for _ in range(2))
-    shape = [int(size) for size in np.frombuffer(sizes, order + "i4")]
-    name = stated.decode("ascii", "replace") if own is None else own
-    if flags & 0xFF == _STRUCT and depth < _DEEPEST:
-        yield from _fields(parts, name, int(np.prod(shape)), order, depth)
-    elif flags & 0xFF in _NUMERIC_CLASSES and not flags & _COMPLEX:
-        number, data = next(parts, (0, b""))
-        if number not in _NUMBERS:
-            raise ValueError(f"an array of type {number}")
-        values = np.frombuffer(data, order + _NUMBERS[number])
-        if len(shape) == 2:
-            if min(shape) < 0 or values.size != shape[0] * shape[1]:
-                raise ValueError(f"{values.size} values in an array of {shape}")
-            yield name, values.reshape(shape, order="F")
-
-
-def _fields(
-    parts: Iterator[tuple[int, bytes]], name: str, number: int, order: str, depth: int
-) -> Iterator[tuple[str, np.ndarray]]:
-    """The arrays of ``number`` structs ``name``: ``parts`` are the length of a field's name, all names, all fields."""
-    (length,) = struct.unpack_from(order + "i", next(parts, (0, b""))[1])
-    names = next(parts, (0, b""))[1]
-    if length < 1:
-        raise ValueError("a struct with fields without names")
-    fields = [names[i : i + length].split(b"\0")[0].decode("ascii", "replace") for i in range(0, len(names), length)]
-    for k in range(number if fields else 0):
-        index = f"({k + 1})" if number > 1 else ""
-        for field in fields:
-            kind, element = next(parts, (-1, b""))
-            if kind < 0:
-                raise ValueError(f"a struct without some of its {counted(number * len(fields), 'field')}")
-            yield from _arrays(kind, element, order, f"{name}{index}.{field}", depth + 1)
+read_hdf5 = read_mat = partial(_read_arrays, _in_process, "export it again", "")
 
 
 # npz: Reads NumPy archives: every real numeric array is a column, or a matrix. Pickled objects are never loaded.

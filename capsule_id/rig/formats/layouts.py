@@ -1,7 +1,6 @@
 """Readers of text exports of any layout, and of LabVIEW measurement files."""
 
 import csv
-import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -24,7 +23,6 @@ from capsule_id.rig.formats.raw import (
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
-    Rows,
     Shape,
     any_rows,
     bare,
@@ -34,7 +32,6 @@ from capsule_id.rig.formats.text import (
     number_in,
     place_of_cell,
     plain_rows,
-    plain_table,
     read_column,
     shown_cell,
     texts_of,
@@ -244,16 +241,12 @@ def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, l
     """
     if delimiter != "," or layout.decimal is not None:
         return
-    rows, before, increasing = 0, -math.inf, True
-    for line in file.lines(first):
-        if not is_row(line):
-            continue
-        found = _COMMA_BETWEEN_DIGITS.fullmatch(line)
-        if found is None:
+    wholes = list[int]()
+    for line in filter(is_row, file.lines(first)):
+        if (found := _COMMA_BETWEEN_DIGITS.fullmatch(line)) is None:
             return
-        whole = int(found[1][:18])
-        rows, before, increasing = rows + 1, whole, increasing and before < whole
-    if rows >= _MANY_ROWS and increasing:
+        wholes.append(int(found[1][:18]))
+    if len(wholes) >= _MANY_ROWS and np.all(np.diff(wholes) > 0):
         return
     raise InputError(
         "a comma between digits must be stated as a separator or a decimal mark",
@@ -329,9 +322,7 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
         alike = all(clock == clocks[-1] for clock in clocks.values())
         sources = [-1, *sources[1:]] if alike else [source for k in sources[1:] for source in (-k, k)]
     headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
-    wanted = [k for k, _ in enumerate(sources) if layout.columns is None or is_wanted(k, (headers,), layout.columns)]
-    rows = _plain(text, segments, separator, decimal, sorted({sources[k] for k in wanted if sources[k] >= 0}))
-    stored = rows.column if rows else _by_cells(text, segments, separator, decimal, layout.missing)
+    stored = _by_cells(text, segments, separator, decimal, layout.missing)
     lines = np.concatenate([np.arange(segment.first, segment.stop) for segment in segments]) + 1
 
     def values(column: int) -> np.ndarray:
@@ -367,18 +358,6 @@ def _clock(segment: _Segment, channel: int, decimal: str | None, path: Path) -> 
             1,
         )
     return start, step
-
-
-def _plain(
-    text: TextFile, segments: Sequence[_Segment], separator: str, decimal: str | None, columns: Sequence[int]
-) -> Rows | None:
-    """The rows of a file with one segment of numbers alone, read in blocks; None for any other file."""
-    segment, width = segments[0], len(segments[0].names)
-    row = text.line(segment.first)
-    *_, last = cells = row.split(separator)
-    mark = decimal or ("," if "," in row and separator != "," else ".")
-    shape = Shape(segment.first, separator, width, mark, trailing=len(cells) == width + 1 and not last.strip())
-    return plain_table(text, shape, columns) if len(segments) == 1 else None
 
 
 def _by_cells(
@@ -429,9 +408,10 @@ def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segmen
                 raise InputError("a segment must have rows", "none", _REMEDY, path, first, 1)
             segments.append(_Segment(keys, tuple(names), first, number))
             if names != [*segments[0].names]:
-                rule = "segments must have the same columns"
-                raise InputError(rule, shown_cell(" ".join(names)), _REMEDY, path, first, 1)
-            state = "between"
+                raise InputError(
+                    "segments must have the same columns", shown_cell(" ".join(names)), _REMEDY, path, first, 1
+                )
+            keys, state = {}, "header"
         key, *cells = (cell.strip() for cell in line.split(separator))
         if state == "names":
             names = [" ".join(name.split()) for name in (key, *cells)]
@@ -439,16 +419,12 @@ def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segmen
                 names.pop()
             state, first = "rows", number + 1
             continue
-        if state == "between":
-            special = (special or key == _SPECIAL) and key != _END_SPECIAL
-            if special or key in ("", _END_SPECIAL):
-                continue
-            keys, state = {}, "header"
-        if key != _END:
+        special = (special or key == _SPECIAL) and key != _END_SPECIAL
+        if key == _END and not special:
+            head, keys, state = (keys, {}, state) if head is None else (head, keys, "names")
+        elif not special and key not in ("", _END_SPECIAL):
             keys[key] = cells
-        else:
-            head, state = (keys, "between") if head is None else (head, "names")
-    if head is None or state == "header":
+    if head is None or keys:
         raise InputError(f"a header must end with {_END}", "the end of the file", _REMEDY, path, number, 1)
     if not segments:
         raise InputError("a LabVIEW measurement file must have a segment", "none", _REMEDY, path, number, 1)

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -68,8 +67,14 @@ def refuse_wide(columns: int, path: Path, line: int | None = None) -> None:
         Naming their number.
     """
     if columns > MOST_COLUMNS:
-        rule, remedy = f"a table must have at most {MOST_COLUMNS} columns", "export fewer channels, a row per sample"
-        raise InputError(rule, str(columns), remedy, path, line, line and 1)
+        raise InputError(
+            f"a table must have at most {MOST_COLUMNS} columns",
+            str(columns),
+            "export fewer channels, a row per sample",
+            path,
+            line,
+            line and 1,
+        )
 
 
 def require(package: str, path: Path) -> None:
@@ -104,7 +109,7 @@ def complete(path: Path, remedy: str) -> Iterator[None]:
 
 
 COMPRESSED = ".gz"
-#: Bytes of a block, and bytes that are decompressed at a time.
+#: Bytes of a block.
 BLOCK = 1 << 20
 WINDOWS = "Windows-1252"
 _CODECS = {"UTF-16": "utf-16", WINDOWS: "cp1252"}
@@ -144,8 +149,14 @@ class TextFile:
         while begin + LONGEST_LINE < len(self._text):
             end = self._text.rfind(b"\n", begin, begin + LONGEST_LINE + 1) + 1
             if not end:
-                rule, remedy = f"a line must have at most {LONGEST_LINE} bytes", "export a row per sample, in lines"
-                raise InputError(rule, "a longer one", remedy, self.path, self._text.count(b"\n", 0, begin) + 1, 1)
+                raise InputError(
+                    f"a line must have at most {LONGEST_LINE} bytes",
+                    "a longer one",
+                    "export a row per sample, in lines",
+                    self.path,
+                    self._text.count(b"\n", 0, begin) + 1,
+                    1,
+                )
             begin = end
 
     def blocks(self, first: int = 0) -> Iterator[tuple[int, bytes]]:
@@ -177,12 +188,10 @@ def _bytes_of(content: bytes, path: Path) -> bytes:
     """The bytes of a text, decompressed."""
     if path.suffix.lower() != COMPRESSED:
         return content
-    found = list[bytes]()
     with complete(path, "compress it again by gzip"), gzip.open(io.BytesIO(content)) as file:
-        for block in iter(partial(file.read, BLOCK), b""):
-            found.append(block)
-            refuse_large(sum(map(len, found)), content, path)
-    return b"".join(found)
+        text = file.read(largest(content) + BLOCK)
+        refuse_large(len(text), content, path)
+    return text
 
 
 def _encoding(raw: bytes, path: Path) -> str:

@@ -1,11 +1,9 @@
 """Readers of text tables: cells, rows of numbers, CSV."""
 
-import csv
 import io
 import json
 import re
 import sys
-import warnings
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -165,7 +163,6 @@ def shown_cell(cell: str) -> str:
 COMMENTS = ("#", "%")
 _NO_CELLS = " \t\r\f\v\n,;"  # spreadsheets write blank rows as separators alone
 _PLAIN = "0123456789+-eE \t"  # characters of rows of numbers, without the separator and the decimal mark
-_SHORT = 1_000_000  # characters of a text that NumPy reads before pandas is imported
 
 
 @dataclass(frozen=True)
@@ -254,41 +251,17 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     if delimiter is not None and text.count(delimiter.encode()) != count * (shape.width - 1 + shape.trailing):
         return None
     used = list(range(shape.width)) if delimiter is None else sorted({*columns, shape.width - 1})
-    text = text.replace(b",", b".") if decimal == "," else text
-    values = _parse(text, delimiter, used)
-    if values is None or values.shape != (count, len(used)) or not np.isfinite(values).all():
+    lines = io.StringIO((text.replace(b",", b".") if decimal == "," else text).decode())
+    usecols = None if delimiter is None else used
+    try:
+        values = np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
+    except ValueError:
+        return None
+    if values.shape != (count, len(used)) or not np.isfinite(values).all():
         return None
     if not values.all() and _TINY.search(text.decode()):
         return None
     return values[:, np.searchsorted(used, columns)]
-
-
-def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray | None:
-    """The numbers of the columns of a text, correctly rounded; None where a cell is no number."""
-    usecols = None if delimiter is None else columns
-    try:
-        if len(text) < _SHORT:
-            lines = io.StringIO(text.decode())
-            return np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
-        import pandas as pd
-
-        with warnings.catch_warnings():
-            # pandas 2 rounds correctly by this option alone; pandas 3 always does so, and warns of the option.
-            warnings.simplefilter("ignore")
-            frame = pd.read_csv(
-                io.BytesIO(text),
-                sep=delimiter or r"\s+",
-                header=None,
-                usecols=usecols,
-                dtype=np.float64,
-                na_filter=False,
-                quoting=csv.QUOTE_NONE,
-                float_precision="round_trip",
-                low_memory=False,
-            )
-    except ValueError:
-        return None
-    return frame.to_numpy()
 
 
 def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | None:
@@ -310,16 +283,6 @@ def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | N
         for index, column in enumerate(columns):
             rows.numbers[column].append(values[:, index])
     return rows
-
-
-def plain_table(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | None:
-    """As ``plain_rows``, for rows that follow one another to the end of the text; None for any other text."""
-    rows = plain_rows(file, shape, columns)
-    count = 0 if rows is None else len(rows.lines)
-    last = shape.first + count
-    if rows is None or count == 0 or (rows.lines[0], rows.lines[-1]) != (shape.first + 1, last):
-        return None
-    return None if any(line.strip() for line in file.lines(last)) else rows
 
 
 def any_rows(
@@ -433,8 +396,11 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")
     shape = Shape(1, delimiter, len(names), decimal)
-    rows = plain_table(file, shape, range(len(names)))
-    columns = tuple(map(rows.column, range(len(names)))) if rows else _read_cells(file, shape)
+    rows = plain_rows(file, shape, range(len(names)))
+    end = 1 + len(rows.lines) if rows else 1
+    # Rows that follow one another, with blank lines alone below them.
+    whole = rows and end in rows.lines[-1:].tolist() and not any(line.strip() for line in file.lines(end))
+    columns = tuple(map(rows.column, range(len(names)))) if rows and whole else _read_cells(file, shape)
 
     def place(row: int | None, column: int) -> Place:
         line = 0 if row is None else row + 1

