@@ -22,6 +22,7 @@ from capsule_id.experiments.free_vibration.experiment import FreeVibration, chec
 from capsule_id.experiments.free_vibration.second_fit import Screening, open_models, rank
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
+from capsule_id.inference.sampling import DEFAULT_BUDGET
 from tests.experiments import bench, random_decays
 from tests.experiments.test_second_fit import SPRING_FORCE, record
 from tests.scipy_decay import scipy_decay
@@ -253,7 +254,7 @@ def test_a_thousand_random_decays_end_with_a_verdict(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_random_decays_are_sampled(tmp_path: Path) -> None:
-    words = [outcome(tmp_path / str(seed), seed, 20_000) for seed in range(1000, 1150)]
+    words = [outcome(tmp_path / str(seed), seed, DEFAULT_BUDGET) for seed in range(1000, 1150)]
     assert len(words) == 150
 
 
