@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from capsule_id.commands import NO_CACHE, PATH
-from capsule_id.commands.capsule_options import (
+from capsule_id.commands.compilation import prepare_jax
+from capsule_id.commands.simulate import (
     DEFAULTS,
     capsule_and_drive,
     capsule_options,
@@ -23,7 +24,6 @@ from capsule_id.commands.capsule_options import (
     number,
     whole_number,
 )
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import Progress, complain, saved, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry

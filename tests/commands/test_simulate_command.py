@@ -11,7 +11,6 @@ import xarray as xr
 from PIL import Image
 
 from capsule_id.commands import add_options
-from capsule_id.commands import capsule_options as options
 from capsule_id.commands import simulate as command
 from capsule_id.errors import InputError
 from capsule_id.physics.model import CapsuleParameters, Excitation
@@ -66,21 +65,21 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     parser = argparse.ArgumentParser()
     add_options(parser, command.OPTIONS)
     drive = ["--G", "1e-3", "--P_d", "4", "--Omega", "30", "--out", "x.csv", "--result", str(tmp_path)]
-    values = options.capsule_values(parser.parse_args([*drive, "--c", "5"]))
+    values = command.capsule_values(parser.parse_args([*drive, "--c", "5"]))
     assert (values["k1"], values["k2"], values["c"], values["m1"]) == (1500.0, 2e4, 5.0, 0.11)
     with pytest.raises(InputError, match="choose from L60"):
-        options.capsule_values(parser.parse_args([*drive, "--spring", "L70"]))
+        command.capsule_values(parser.parse_args([*drive, "--spring", "L70"]))
     # Before: no contact, and not a word.
     for words in ([*drive, "--G", "inf"], [word for word in drive if word not in ("--result", str(tmp_path))]):
         with pytest.raises(InputError, match="--spring needs the result that it is of, and a gap"):
-            options.capsule_values(parser.parse_args([*words, "--k2", "2e4", "--spring", "L60"]))
+            command.capsule_values(parser.parse_args([*words, "--k2", "2e4", "--spring", "L60"]))
     other = {"parameters": rows, "provenance": {"friction": "mine.Law"}}
     (tmp_path / "parameters.json").write_text(json.dumps(other), encoding="utf-8")
     with pytest.raises(InputError, match=r"compute with eq. \(1\).*mine.Law"):
-        options.capsule_values(parser.parse_args(drive))
+        command.capsule_values(parser.parse_args(drive))
     (tmp_path / "parameters.json").write_text("[]", encoding="utf-8")
     with pytest.raises(InputError, match="takes a result"):
-        options.capsule_values(parser.parse_args(drive))
+        command.capsule_values(parser.parse_args(drive))
 
 
 def test_a_gap_far_beyond_the_motion_is_a_warning_in_mm(tmp_path: Path) -> None:
