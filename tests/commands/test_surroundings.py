@@ -21,6 +21,12 @@ SURROUNDINGS: Mapping[str, tuple[dict[str, str | None], bytes, str, str]] = {
          "PYTHONUTF8": "0", "HOME": "/nonexistent", "XDG_CACHE_HOME": "/dev/null", "TMPDIR": "/nonexistent", "TERM": None},
         b"text.usetex: True\nfont.family: NoSuchFont\n# \xff\n", NO_TEXT, "</dev/null 2>/dev/full",
     ),
+    "everything else": (
+        {"MPLBACKEND": "tkagg", "DISPLAY": None, "MATPLOTLIBRC": "/nonexistent", "MPLCONFIGDIR": "/dev/null", "HOME": None,
+         "USERPROFILE": None, "JAX_COMPILATION_CACHE_DIR": "/dev/null/x", "LC_ALL": "xx_YY.nosuch", "COLUMNS": "0",
+         "PYTHONIOENCODING": "ascii:strict", "PYTHONOPTIMIZE": "2"},
+        b"\xff\xfe\n", "Prüf $stand ü", "</dev/null",
+    ),
     "no such backend": ({"MPLBACKEND": "nosuch"}, b"", "rig", ""),
     "a backend with windows": ({"MPLBACKEND": "tkagg", "DISPLAY": None}, b"", "rig", ""),
     "LaTeX": ({}, b"text.usetex: True\n", "rig", ""),
@@ -44,6 +50,9 @@ SURROUNDINGS: Mapping[str, tuple[dict[str, str | None], bytes, str, str]] = {
     "warnings as errors": ({"PYTHONWARNINGS": "error"}, b"", "rig", ""),
     "without docstrings": ({"PYTHONOPTIMIZE": "2"}, b"", "rig", ""),
 }  # fmt: skip
+#: Tried in the full tier. "everything" and "everything else" hold all the others but these; where one of the two fails,
+#: the slow tests say which variable it is.
+FULL = {"everything else", "a home that is a file", "no streams", "warnings as errors"}
 
 
 def fitted(here: Path, name: str, *words: str) -> subprocess.CompletedProcess[bytes]:
@@ -58,7 +67,15 @@ def fitted(here: Path, name: str, *words: str) -> subprocess.CompletedProcess[by
 
 
 @pytest.mark.parametrize(
-    "name", [name if name == "everything" else pytest.param(name, marks=pytest.mark.full) for name in SURROUNDINGS]
+    "name",
+    [
+        "everything",
+        *(
+            pytest.param(name, marks=pytest.mark.full if name in FULL else pytest.mark.slow)
+            for name in SURROUNDINGS
+            if name != "everything"
+        ),
+    ],
 )
 def test_a_fit_ends_with_its_result(tmp_path: Path, name: str) -> None:
     """Each of these ended in an internal failure after the fit, or could have."""
@@ -73,7 +90,7 @@ def test_a_fit_ends_with_its_result(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["no such backend", "everything"])
+@pytest.mark.parametrize("name", ["everything", pytest.param("no such backend", marks=pytest.mark.slow)])
 def test_figures_are_the_same_in_all_surroundings(tmp_path: Path, name: str) -> None:
     """The style and the backend are those of the package; a sample too is drawn and read back."""
     pictures, draws = [], []
