@@ -9,6 +9,7 @@ from scipy import signal
 from capsule_id.experiments.free_vibration.models import decay as rubbed
 from capsule_id.records import release
 from capsule_id.records.release import FreeDecay, find_free_decay
+from tests.capsule_cases import jit_quickly
 from tests.experiments.bench import K1, M1, released
 from tests.records.test_fault_detectors import PERIOD, RATE, TIME, decay, encoder
 from tests.release_records import FORMS, draw
@@ -128,10 +129,12 @@ def test_a_decay_recorded_from_any_phase_is_not_pushed(number: int) -> None:
     """Viscous, dry, quadratic damping and cubic springs, in white and correlated noise."""
     rng = np.random.default_rng(0)
     time, found = np.arange(250) / 500.0, 0
+    # One compiled program for each sum of forces.
+    motion = jit_quickly(lambda time, forces: rubbed(time, forces, 2e-3, 0.0, 40).x_rel)
     for more in ({}, {"F_dry": 0.05 * K1 * 2e-3}, {"c_q": 20.0}, {"k_cubic": 0.3 * K1 / 4e-6}):
         for _ in range(number):
             forces = {"k1": K1, "c": rng.choice([0.3, 1.0]), "m1": M1, **more}
-            x = rubbed(time + rng.uniform(0.0, PERIOD), forces, 2e-3, 0.0, 40).x_rel
+            x = motion(time + rng.uniform(0.0, PERIOD), forces)
             rho = rng.choice([0.0, 0.9, 0.98])
             noise = np.asarray(signal.lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal(len(time))))
             free = cast(FreeDecay, find_free_decay(time, np.asarray(x) + 4e-5 * noise, displacement=True))
