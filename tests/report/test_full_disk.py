@@ -140,19 +140,12 @@ def test_other_outputs_of_commands(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    "sizes",
-    [
-        pytest.param([2**power for power in (14, 16, 17, 18, 20, 26)], id="some"),
-        pytest.param(SIZES, id="all", marks=pytest.mark.slow),
-    ],
-)
-def test_every_size_of_disk(tmp_path: Path, sizes: list[int]) -> None:
+def test_every_size_of_disk(tmp_path: Path) -> None:
     """A real process; no traceback and no end by a signal. The old result stays; a resumed run gives the same numbers."""
     small_rig(tmp_path / "rig")
     env = environment(XDG_CACHE_HOME=str(tmp_path / "cache"), TMPDIR=str(tmp_path))
     ends = []
-    for size in (None, *sizes, None):
+    for size in (None, *SIZES, None):
         out = "whole" if size is None and not ends else "out"
         before = listing(tmp_path / out) if (tmp_path / out).exists() else {}
         limit = f"ulimit -f {size // 512}; " if size else ""  # in blocks of 512 bytes
