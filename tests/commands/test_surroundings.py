@@ -5,7 +5,6 @@ import os
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +20,12 @@ SURROUNDINGS: Mapping[str, tuple[dict[str, str | None], bytes, str, str]] = {
         {"MPLBACKEND": "nosuch", "MPLCONFIGDIR": "/nonexistent", "LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0",
          "PYTHONUTF8": "0", "HOME": "/nonexistent", "XDG_CACHE_HOME": "/dev/null", "TMPDIR": "/nonexistent", "TERM": None},
         b"text.usetex: True\nfont.family: NoSuchFont\n# \xff\n", NO_TEXT, "</dev/null 2>/dev/full",
+    ),
+    "everything else": (
+        {"MPLBACKEND": "tkagg", "DISPLAY": None, "MATPLOTLIBRC": "/nonexistent", "MPLCONFIGDIR": "/dev/null", "HOME": None,
+         "USERPROFILE": None, "JAX_COMPILATION_CACHE_DIR": "/dev/null/x", "LC_ALL": "xx_YY.nosuch", "COLUMNS": "0",
+         "PYTHONIOENCODING": "ascii:strict", "PYTHONOPTIMIZE": "2"},
+        b"\xff\xfe\n", "Prüf $stand ü", "</dev/null",
     ),
     "no such backend": ({"MPLBACKEND": "nosuch"}, b"", "rig", ""),
     "a backend with windows": ({"MPLBACKEND": "tkagg", "DISPLAY": None}, b"", "rig", ""),
@@ -45,6 +50,15 @@ SURROUNDINGS: Mapping[str, tuple[dict[str, str | None], bytes, str, str]] = {
     "warnings as errors": ({"PYTHONWARNINGS": "error"}, b"", "rig", ""),
     "without docstrings": ({"PYTHONOPTIMIZE": "2"}, b"", "rig", ""),
 }  # fmt: skip
+#: Tried in the full tier. "everything" and "everything else" hold the others; where one of the two fails, the slow tests
+#: say which variable it is. matplotlib looks into MATPLOTLIBRC where the working folder has no matplotlibrc only.
+FULL = {
+    "everything else",
+    "another place of matplotlibrc",
+    "a home that is a file",
+    "no streams",
+    "warnings as errors",
+}
 
 
 def fitted(here: Path, name: str, *words: str) -> subprocess.CompletedProcess[bytes]:
@@ -58,17 +72,17 @@ def fitted(here: Path, name: str, *words: str) -> subprocess.CompletedProcess[by
     return subprocess.run(shell, cwd=here, env=environment(**variables), capture_output=True, timeout=300, check=False)
 
 
-#: What "everything" does not contain; the others are its parts.
-FURTHER = ("JAX's cache in no folder", "ASCII streams", "no streams", "warnings as errors", "without docstrings")
-
-
-def marked(name: str) -> Any:
-    """The core has all surroundings at once, the full tier what they do not contain."""
-    marks = pytest.mark.full if name in FURTHER else pytest.mark.slow
-    return name if name == "everything" else pytest.param(name, marks=marks)
-
-
-@pytest.mark.parametrize("name", [marked(name) for name in SURROUNDINGS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "everything",
+        *(
+            pytest.param(name, marks=pytest.mark.full if name in FULL else pytest.mark.slow)
+            for name in SURROUNDINGS
+            if name != "everything"
+        ),
+    ],
+)
 def test_a_fit_ends_with_its_result(tmp_path: Path, name: str) -> None:
     """Each of these ended in an internal failure after the fit, or could have."""
     done = fitted(tmp_path, name, "--no-sample", "--quiet")
@@ -82,7 +96,7 @@ def test_a_fit_ends_with_its_result(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", [pytest.param("no such backend", marks=pytest.mark.slow), "everything"])
+@pytest.mark.parametrize("name", ["everything", pytest.param("no such backend", marks=pytest.mark.slow)])
 def test_figures_are_the_same_in_all_surroundings(tmp_path: Path, name: str) -> None:
     """The style and the backend are those of the package; a sample too is drawn and read back."""
     pictures, draws = [], []

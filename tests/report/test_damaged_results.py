@@ -122,11 +122,20 @@ def outcome(folder: Path, name: str, summary: pd.DataFrame, capsys: pytest.Captu
     return "ok" if loaded.summary.equals(summary) else "other numbers"
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_any_damage_is_named(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "times"),
+    [
+        (0, 112),
+        pytest.param(1, 700, marks=pytest.mark.full),
+        pytest.param(1, 3000, marks=[pytest.mark.full, pytest.mark.slow]),
+    ],
+)
+def test_any_damage_is_named(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int, times: int
+) -> None:
     found: dict[str, list[str]] = {}
     summary = load(whole).summary
-    for number in range(112 if seed == 0 else 3000):
+    for number in range(times):
         random = np.random.default_rng([seed, number])
         name, damage = DAMAGES[number % len(DAMAGES)]
         folder = tmp_path / str(number)
