@@ -46,6 +46,7 @@ NOT_OPTIMISED = {
     "test_forces.py",
     "test_foreign_law.py",
     "test_friction_against_load.py",
+    "test_friction_family.py",
     "test_friction_laws.py",
     "test_general_derivatives.py",
     "test_general_faults.py",
