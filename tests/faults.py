@@ -134,10 +134,10 @@ def drawn(tree: Path = ROOT, seed: int = SEED, number: int = NUMBER) -> list[Fau
     """The faults of a seed, in turn over operators and parts; of one place there is one fault at most."""
     rng, found = np.random.default_rng(seed), list[Fault]()
     pairs = [(part, operator) for operator in OPERATORS for part in PARTS]
+    places = cache(lambda part, operator: list(sites(tree, part, operator)))
     for i in range(number):
-        part, operator = pairs[i % len(pairs)]
         taken = {(one.path, one.line) for one in found}
-        known = [one for one in sites(tree, part, operator) if (one.path, one.line) not in taken]
+        known = [one for one in places(*pairs[i % len(pairs)]) if (one.path, one.line) not in taken]
         found.append(known[int(rng.integers(len(known)))])
     return found
 

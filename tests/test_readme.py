@@ -20,7 +20,7 @@ from capsule_id.report.columns import COLUMNS
 from capsule_id.rig.model import ModelChoices
 from capsule_id.rig.schema import OPTIONAL
 from capsule_id.views import Trust
-from tests.cli_tools import ROOT, run
+from tests.cli_tools import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 GUIDE_FOLDER = ROOT / "capsule_id" / "guide"
@@ -66,8 +66,20 @@ def test_the_two_commands_set_up_and_run() -> None:
     assert "test" in PROJECT["optional-dependencies"]
 
 
-def test_a_record_of_ones_own_gives_k1(tmp_path: Path) -> None:
-    """The steps of README, from a file with headers of a laboratory program to k1."""
+def test_a_record_of_ones_own_gives_k1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The steps of README, from a file with headers of a laboratory program to k1.
+
+    In this process: a child process would import JAX for each step. That the installed command runs in a process of its
+    own stands in ``test_main_job.py``.
+    """
+    monkeypatch.chdir(tmp_path)
+
+    def run(command: str, *words: str) -> tuple[int, str, str]:
+        code = {"capsule-id": cli.capsule_id, "fit-params": cli.fit_params}[command](words)
+        return code, *capsys.readouterr()
+
     rig, m1, k1, c = tmp_path / "my-rig", 0.11, 1420.0, 1.9
     rig.mkdir()
     description, columns = blocks("toml")
@@ -86,21 +98,20 @@ def test_a_record_of_ones_own_gives_k1(tmp_path: Path) -> None:
     table = rig / tomllib.loads(description)["experiment"][0]["file"]
 
     check, fit = (line.removeprefix(".venv/bin/").split() for line in blocks("sh")[2].splitlines())
-    names = {"capsule-id": "capsule_id", "fit-params": "fit_params"}
     table.write_text(f"{header}\n{body}", encoding="utf-8")
-    checked = run(*check[1:], cwd=tmp_path, name=names[check[0]])
-    assert (checked.returncode, checked.stdout.splitlines()[-1]) == (0, "no findings")
+    code, out, _ = run(*check)
+    assert (code, out.splitlines()[-1]) == (0, "no findings")
 
     table.write_text(f"{own}\n{body}", encoding="utf-8")
-    refused = run(*check[1:], cwd=tmp_path, name=names[check[0]])
-    assert refused.returncode == cli.BAD_INPUT
-    assert columns.strip() in refused.stderr
+    code, _, error = run(*check)
+    assert code == cli.BAD_INPUT
+    assert columns.strip() in error
     (rig / "rig.toml").write_text(description + columns, encoding="utf-8")
-    checked = run(*check[1:], cwd=tmp_path, name=names[check[0]])
-    assert (checked.returncode, checked.stdout.splitlines()[-1]) == (0, "no findings")
-    done = run(*fit[1:], "--no-sample", "--quiet", cwd=tmp_path, name=names[fit[0]])
-    assert (done.returncode, done.stderr) == (0, "")
-    value, sd = (float(x) for x in re.findall(r"^k1 +N/m +(\S+) ± (\S+)", done.stdout, re.MULTILINE)[0])
+    code, out, _ = run(*check)
+    assert (code, out.splitlines()[-1]) == (0, "no findings")
+    code, out, error = run(*fit, "--no-sample", "--quiet")
+    assert (code, error) == (0, "")
+    value, sd = (float(x) for x in re.findall(r"^k1 +N/m +(\S+) ± (\S+)", out, re.MULTILINE)[0])
     assert abs(value - k1) < 3.0 * sd < 0.02 * k1
     (report,) = re.findall(r"`(results/my-rig/\S+)`", README)
     assert (tmp_path / report).is_file()

@@ -17,6 +17,7 @@ from capsule_id.cli import fit_params
 from capsule_id.console import Progress
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.output import CHAINS
+from capsule_id.report.html import pictures
 from tests.cli_tools import CODE, environment, listing, same_result, small_rig
 
 WORDS = ("rig", "--quiet", "--max-steps", "60")
@@ -55,6 +56,8 @@ def here(uninterrupted: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def shorten(patch: pytest.MonkeyPatch) -> None:
+    """``SHORT``, and reports without pictures: the tests compare the numbers."""
+    patch.setattr("capsule_id.report.write.pictures", lambda _: ())
     patch.setattr("capsule_id.inference.moves.SAVE_EVERY", 0.0)
     for name, value in SHORT.items():
         patch.setattr(f"capsule_id.inference.sampling.{name}", value)
@@ -75,6 +78,7 @@ def same_as_uninterrupted(folder: Path, out: str) -> None:
     same_result(folder / out, folder / "whole")
 
 
+@pytest.mark.full
 def test_two_runs_agree_to_the_byte(here: Path) -> None:
     assert fit_params([*WORDS, "--out", "again"]) == 0
     same_as_uninterrupted(here, "again")
@@ -100,7 +104,7 @@ def test_an_ensemble_never_repeats_itself(here: Path) -> None:
 @pytest.mark.parametrize(
     ("stage", "draws"),
     [
-        ("point fit", 0),
+        pytest.param("point fit", 0, marks=pytest.mark.full),
         ("pilot", 0),
         pytest.param("e", 1, marks=pytest.mark.slow),
         ("e", 35),
@@ -115,6 +119,8 @@ def test_interrupted_and_resumed(
         os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as patch:
+        if stage == "report":  # the signal is read where the first picture is drawn
+            patch.setattr("capsule_id.report.write.pictures", pictures)
         die_in_progress(patch, stage, draws, interrupt)
         assert fit_params([*WORDS, "--out", "out"]) == 130
     assert capsys.readouterr().err == "fit-params: interrupted; --resume continues from the saved state\n"
@@ -150,7 +156,7 @@ def test_killed_inside_emcee_and_spoilt_afterwards(here: Path, monkeypatch: pyte
         pytest.param("truncated", marks=pytest.mark.slow),
         "flipped",
         pytest.param("empty", marks=pytest.mark.slow),
-        "missing",
+        pytest.param("missing", marks=pytest.mark.full),
     ],
 )
 def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPatch, damage: str) -> None:

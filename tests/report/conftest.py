@@ -10,7 +10,9 @@ import pytest
 
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
+from capsule_id.report.figures.style import own_style
 from capsule_id.report.html import Picture, pictures
+from capsule_id.report.write import result_files
 from capsule_id.rig.model import Quantity, Rig
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 
@@ -233,7 +235,16 @@ def result() -> Result:
 @pytest.fixture(scope="session")
 def drawn(result: Result) -> tuple[Picture, ...]:
     """Its pictures."""
-    return pictures(result)
+    with own_style():
+        return pictures(result)
+
+
+@pytest.fixture(scope="session")
+def files(result: Result, drawn: tuple[Picture, ...]) -> dict[str, bytes]:
+    """Its files, without drawing the pictures once more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("capsule_id.report.write.pictures", lambda _: drawn)
+        return result_files(result)
 
 
 @pytest.fixture(scope="session")

@@ -15,8 +15,7 @@ import pytest
 from capsule_id import load
 from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
-from capsule_id.inference.result import Result
-from capsule_id.report.write import result_files, write_result
+from capsule_id.report.write import write_result
 
 #: What stands in the place of a value of JSON.
 OTHERS = (None, True, 0, -1, 1e400, "x", "", [], [[]], {}, {"x": 1}, {"array": "a0"}, {"object": []}, 10**400)
@@ -24,9 +23,9 @@ Damage = Callable[[bytes, np.random.Generator], bytes]
 
 
 @pytest.fixture(scope="module")
-def whole(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(files: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("whole")
-    write_result(result_files(result), path)
+    write_result(files, path)
     return path
 
 

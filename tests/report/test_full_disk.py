@@ -16,9 +16,8 @@ from capsule_id.cli import capsule_id, fit_params
 from capsule_id.commands import compilation
 from capsule_id.errors import OutputError
 from capsule_id.inference.moves import ChainStore
-from capsule_id.inference.result import Result
 from capsule_id.motions import sweep
-from capsule_id.report.write import result_files, write_result
+from capsule_id.report.write import write_result
 from tests.cli_tools import Killed, argv, environment, failing, listing, same_result, small_rig
 
 resource = pytest.importorskip("resource", reason="limits of files are those of POSIX")
@@ -38,8 +37,8 @@ def limited(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_a_result_needs_what_is_said(result: Result, tmp_path: Path) -> None:
-    files, refused = result_files(result), 0
+def test_a_result_needs_what_is_said(files: dict[str, bytes], tmp_path: Path) -> None:
+    refused = 0
     largest = max(map(len, files.values()))
     for size in SIZES:
         text = ""

@@ -19,6 +19,7 @@ from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report import columns
 from capsule_id.report.columns import table_text
+from capsule_id.report.html import Picture
 from capsule_id.report.write import data_tree, netcdf_bytes, parameters_json, read_sample, result_files, write_result
 from capsule_id.views import Finding
 from tests.report.conftest import COLOURED
@@ -38,9 +39,9 @@ def arviz() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(files: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("results")
-    write_result(result_files(result), path)
+    write_result(files, path)
     return path
 
 
@@ -137,9 +138,10 @@ def test_a_finding_without_words_is_given_by_its_facts(result: Result) -> None:
 
 
 def test_a_column_declared_once_is_in_every_output(
-    result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    result: Result, drawn: tuple[Picture, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Negative control: without the declaration it is in none."""
+    monkeypatch.setattr("capsule_id.report.write.pictures", lambda _: drawn)  # a picture has no column
     shrinkage = columns.OutputColumn(
         "z_paper",
         "z of the paper",
@@ -198,16 +200,24 @@ def test_csv_reads_back(folder: Path, result: Result) -> None:
         np.testing.assert_array_equal(table[column].to_numpy(float), both[column].to_numpy(float))
 
 
-def test_directory_must_exist(result: Result, tmp_path: Path) -> None:
+def test_directory_must_exist(files: dict[str, bytes], tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="No such file or directory; make this folder"):
-        write_result(result_files(result), tmp_path / "absent")
+        write_result(files, tmp_path / "absent")
     assert not (tmp_path / "absent").exists()
 
 
-def test_same_result_same_bytes(folder: Path, maker: Callable[..., Result], tmp_path: Path) -> None:
+def test_same_result_same_bytes(
+    folder: Path,
+    drawn: tuple[Picture, ...],
+    maker: Callable[..., Result],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     write_result(result_files(maker()), tmp_path)
     for path in (p for p in folder.rglob("*") if p.is_file()):
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
+    # Negative control: the numbers alone, beside the pictures of the first result, give other bytes.
+    monkeypatch.setattr("capsule_id.report.write.pictures", lambda _: drawn)
     other = tmp_path / "other"
     other.mkdir()
     write_result(result_files(maker(seed=1)), other)

@@ -12,6 +12,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 from capsule_id.inference.curvature import covariance
 from capsule_id.inference.least_squares import SOLVER, LeastSquaresFit, Solver, least_squares
@@ -214,12 +215,20 @@ PROBLEMS: tuple[StrdProblem, ...] = (
 )
 
 
+@jax.jit
+def _both(residual: Partial, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return residual(x), jax.jacfwd(residual)(x)
+
+
 def solve(residual: Callable[[jax.Array], jax.Array], starts: np.ndarray, solver: Solver = SOLVER) -> LeastSquaresFit:
-    """Least squares of a JAX function, its Jacobian in forward mode."""
-    both = jax.jit(lambda x: (residual(x), jax.jacfwd(residual)(x)))
+    """Least squares of a JAX function, its Jacobian in forward mode.
+
+    The arrays of a ``Partial`` are arguments of the program: fits of other data compile nothing.
+    """
+    function = residual if isinstance(residual, Partial) else Partial(residual)
 
     def linearise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        residuals, jacobian = both(jnp.asarray(x))
+        residuals, jacobian = _both(function, jnp.asarray(x))
         return np.asarray(residuals), np.asarray(jacobian)
 
     return least_squares(linearise, starts, solver)

@@ -156,8 +156,9 @@ def walkers(marginal: MarginalPosterior, number: int) -> np.ndarray:
     return v[np.isfinite(total(marginal, v))][:number]
 
 
-def test_integrals_against_adaptive_quadrature(marginal: MarginalPosterior) -> None:
-    v = walkers(marginal, WALKERS)
+@pytest.mark.parametrize("number", [2, pytest.param(WALKERS, marks=pytest.mark.full)])
+def test_integrals_against_adaptive_quadrature(marginal: MarginalPosterior, number: int) -> None:
+    v = walkers(marginal, number)
     whole, _ = marginal.restore(v, 0)
     expected = [by_quadrature(marginal.target, u) for u in whole]
     np.testing.assert_allclose(total(marginal, v), expected, rtol=0.0, atol=LIMIT)
