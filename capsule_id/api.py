@@ -382,10 +382,10 @@ def fit(
     progress : called with (draws done, draws until the next check, the stage); True or False: shown or not, by default
         on a terminal and in a notebook
     registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages
-    friction : class of a friction law in place of eq. (1); its parameters are fitted instead of mu and v_s
+    friction, contact : class of a friction law in place of eq. (1), and of a force in place of the support spring; their
+        parameters are fitted instead of mu and v_s, or of k2
     ess : sampling stops at this bulk and tail effective sample size of every parameter
     preliminary : called before the sampling with the point fit: a result without intervals, panels, notes and records
-    contact : class of a force in place of the support spring; its parameters are fitted instead of k2
 
     Raises
     ------
@@ -398,14 +398,11 @@ def fit(
     if not isinstance(seed, int) or seed < 0:
         raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")
     if budget is not None and budget < 1:
-        raise InputError(
-            "budget must be positive", str(budget), "give 1 or more steps, or None for the point fit alone"
-        )
+        raise InputError("budget must be positive", str(budget), "give 1 or more steps, or None: the point fit alone")
     if not 0 < ess < float("inf"):
         raise InputError("ess must be positive and finite", str(ess), f"give {DEFAULT_ESS:.0f}, the default")
-    law = friction_of(rig, friction, contact)
     kinds, seeds = registry or default_registry(), stage_seeds(seed)
-    made_from = provenance(rig, seed, experiments, law.source)
+    made_from = provenance(rig, seed, experiments, friction_of(rig, friction, contact).source)
     with Progress(progress) if isinstance(progress, bool | None) else nullcontext(progress) as show:
         show(0, 1, "point fit")
         readings = check_readings(rig, experiments, kinds)

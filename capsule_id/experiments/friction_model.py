@@ -95,6 +95,12 @@ class FrictionModel:
         role = f"the contact {contact.__name__}"
         _check_leaves(role, contact, GAP, "the gap, m", lambda: cast(Any, contact)(**{**medians, GAP: 1.0}))
 
+    @property
+    def replaced(self) -> set[str]:
+        """Symbols of eq. (1) and of the support spring that these laws do not have."""
+        eq_1, own = ({row.symbol for row in law.parameters} for law in (CoulombStribeck, self.law))
+        return (eq_1 - own) | (set() if self.contact is None else {"k2"})
+
     def support(self, spring: str | None) -> list[Parameter]:
         """The sampled parameters of a support: k2 of the ``spring``, or the leaves of ``contact``; None: no support."""
         if spring is None:

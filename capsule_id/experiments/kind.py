@@ -309,24 +309,11 @@ def make_experiments(
     for name, kind in kinds.items():
         kind.check([table for table in tables if table.kind == name])
     # The law loads JAX, which takes seconds. A faulty folder must be reported before.
-    from capsule_id.experiments.friction_model import EQUATION_1, friction_of
+    from capsule_id.experiments.friction_model import friction_of
 
     model = friction_of(rig, friction, contact)
     model.check(kinds.parameters)
     made = tuple(e for table in tables for e in kinds[table.kind].make(table, rig, model))
-    absent = {row.symbol for row in EQUATION_1.law.parameters} - {row.symbol for row in model.law.parameters}
-    absent |= set() if contact is None else {"k2"}
-    for e in made:
-        if taken := absent.intersection(row.symbol for row in e.parameters):
-            rule = f"the kind {e.kind} reads {min(taken)}, which {model.name} replaces"
-            raise InputError(rule, e.label, f"remove {e.label}, or fit without this law", rig.folder / "rig.toml")
-    springs = sorted({str(t.settings.spring) for t in tables if getattr(t.settings, "spring", None) is not None})
-    if contact is not None and len(springs) > 1:
-        rule, remedy = (
-            f"the contact {contact.__name__} describes one spring",
-            "fit the runs of each spring by themselves",
-        )
-        raise InputError(rule, ", ".join(springs), remedy, rig.folder / "rig.toml")
     measured = {row.symbol for e in made for row in e.parameters}
     for symbol in rig.model.free if experiments == "all" else ():
         if symbol not in measured:
@@ -334,12 +321,25 @@ def make_experiments(
             wanted = 'with direction = "backward"' if symbol == "mu_back" else "with a sliding capsule"
             remedy = f'remove "{symbol}" from free, or add an experiment {wanted}'
             raise InputError(rule, "none", remedy, rig.folder / "rig.toml")
+    _check_laws(made, model, rig)
+    return made
+
+
+def _check_laws(made: Sequence["Experiment"], model: "FrictionModel", rig: Rig) -> None:
+    """Refuse experiments that read what the laws of the fit replace, or whose masses the friction law needs."""
+    for e in made:
+        if taken := model.replaced.intersection(row.symbol for row in e.parameters):
+            rule = f"the kind {e.kind} reads {min(taken)}, which {model.name} replaces"
+            raise InputError(rule, e.label, f"remove {e.label}, or fit without this law", rig.folder / "rig.toml")
+    springs = sorted({str(spring) for e in made if (spring := getattr(e.table.settings, "spring", None)) is not None})
+    if model.contact is not None and len(springs) > 1:
+        rule, remedy = f"the contact of {model.name} describes one spring", "fit the runs of each spring by themselves"
+        raise InputError(rule, ", ".join(springs), remedy, rig.folder / "rig.toml")
     for e in made:
         for mass in e.masses:
             if getattr(rig, mass) is None:
                 rule = f"the friction law {model.name} is in N, and {e.label} needs {mass}"
                 raise InputError(rule, "not stated", f"add {mass} to [rig]", rig.folder / "rig.toml")
-    return made
 
 
 def paper_estimates(experiments: Sequence["Experiment"], registry: Registry | None = None) -> dict[str, float]:

@@ -280,7 +280,7 @@ def _fit(
     best = np.inf, poles, 0.0, 0.0
     for _ in range(steps + 1):
         columns = np.vstack([_columns(poles[0] * time, poles[1], values, sd), prior])
-        linear = np.delete(columns, [3, 4], axis=1)
+        linear = columns[:, [0, 1, 2, 5, 6, 7]]
         found = np.linalg.lstsq(linear, wanted, rcond=1e-10)[0]
         cost = float(np.sum((wanted - linear @ found) ** 2))
         if cost < best[0]:
