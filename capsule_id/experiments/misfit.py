@@ -42,7 +42,8 @@ def marginal_log_density(yy: Any, ay: Any, aa: Any, n: Any, xp: ModuleType = jnp
         return -0.5 * (n * LOG_2PI + log_det + yy - xp.sum(ay * mean, axis=-1))
     rest, rows, log_det = yy, xp.broadcast_to(xp.eye(aa.shape[-1]), aa.shape) + aa, 0.0
     while rows.shape[-1]:
-        pivot, first = rows[..., 0, 0], rows[..., 0, 1:]
+        # Every pivot is 1 or more; of readings without noise, rounding may leave less.
+        pivot, first = xp.where(rows[..., 0, 0] < 1.0, 1.0, rows[..., 0, 0]), rows[..., 0, 1:]
         log_det, rest = log_det + xp.log(pivot), rest - ay[..., 0] ** 2 / pivot
         ratio = first / pivot[..., None]
         ay = ay[..., 1:] - ratio * ay[..., :1]
@@ -82,8 +83,13 @@ def conditional_mean(ay: Any, aa: Any, xp: ModuleType = jnp) -> Any:
 def conditional_draw(ay: np.ndarray, aa: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """One draw of b given y, (p,)."""
     precision = np.eye(len(aa)) + aa
-    chol = np.linalg.cholesky(precision)
-    return np.linalg.solve(precision, ay) + np.linalg.solve(chol.T, rng.standard_normal(len(aa)))
+    normal = rng.standard_normal(len(aa))
+    try:
+        return np.linalg.solve(precision, ay) + np.linalg.solve(np.linalg.cholesky(precision).T, normal)
+    except np.linalg.LinAlgError:  # readings without noise: rounding hides that every eigenvalue is 1 or more
+        values, vectors = np.linalg.eigh(precision)
+        values = np.maximum(values, 1.0)
+        return vectors @ ((vectors.T @ ay) / values + normal / np.sqrt(values))
 
 
 # misfit: Misfit between readings and model, and the density of readings as a function of one scatter.

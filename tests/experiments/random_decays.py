@@ -24,7 +24,7 @@ def motion(rng: np.random.Generator, time: np.ndarray, ratio: float, omega: floa
         return [s[1], -2.0 * ratio * omega * s[1] - omega**2 * (s[0] + cubic * s[0] ** 3 + friction)]
 
     velocity = rng.choice([0.0, rng.uniform(-1.0, 1.0)]) * omega
-    if damage == "beyond the barrier":  # it would leave the barrier behind
+    if cubic < 0.0:  # it would leave the barrier behind
         velocity = 0.0
     solution = solve_ivp(
         rate, (0.0, time[-1] + 1e-9), [1.0, velocity], "LSODA", rtol=1e-7, atol=1e-10, dense_output=True

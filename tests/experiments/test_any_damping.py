@@ -229,6 +229,13 @@ def test_a_random_decay_ends_with_a_verdict_or_is_refused(tmp_path: Path, seed: 
     outcome(tmp_path, seed, None)
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("seed", [1021, 1039])
+def test_a_random_decay_is_sampled_to_its_verdict(tmp_path: Path, seed: int) -> None:
+    """Three readings left for the paper's estimate, and readings without noise (before: a warning, an internal failure)."""
+    outcome(tmp_path, seed, DEFAULT_BUDGET)
+
+
 def outcome(path: Path, seed: int, budget: int | None) -> str:
     """Fit the record ``seed``; it must not end in an error, in a warning, or with numbers that are not finite."""
     rig = random_decays.write(path, seed)

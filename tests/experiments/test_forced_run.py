@@ -54,7 +54,7 @@ def test_a_gain_is_integrated_out_where_it_is_asked_for() -> None:
 
 def test_the_gain_of_an_instrument_is_a_parameter_of_the_fit() -> None:
     own = table(0, start="moving", without=("acceleration_rod", "x_capsule"))
-    lvdt = Instrument("lvdt", "m", Quantity(0.02, 0.01))
+    lvdt = Instrument("lvdt", "m", {"gain": Quantity(0.02, 0.01)})
     own = replace(own, columns={**own.columns, "x_rel": replace(own.columns["x_rel"], instrument=lvdt)})
     run, values = ForcedRun(own, bench.rig(own)), {**theta(0), "gain[lvdt]": 0.021}
     assert [row.prior for row in run.parameters if row.name == "gain[lvdt]"] == [Prior("normal", 0.02, 0.01)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.experiments.misfit import MANY_NUISANCES, MANY_READINGS, VARIANCES, Misfit, Moments
+from capsule_id.experiments.misfit import MANY_NUISANCES, MANY_READINGS, VARIANCES, Misfit, Moments, conditional_draw
 
 RNG = np.random.default_rng(5)
 RAW, DESIGN = RNG.standard_normal(7), RNG.standard_normal((7, 3))
@@ -68,3 +68,15 @@ def test_many_readings_of_unequal_variance(columns: int, ratio: float, xp: Modul
     assert np.shape(summed.yy) == (VARIANCES,)
     expected = misfit.log_density(scatters, np)
     np.testing.assert_allclose(summed.log_density(scatters, xp), expected, rtol=1e-9, atol=1e-5)
+
+
+def test_a_draw_of_nuisances_whose_precision_is_lost_in_rounding() -> None:
+    """Two nearly equal columns, readings without noise: the drawn sum is known, and NumPy finds no root of the precision."""
+    design = 1e9 * np.column_stack([np.ones(20), 1.0 + 1e-12 * np.arange(20)])
+    aa, ay = design.T @ design, design.T @ (design @ np.array([0.3, 0.4]))
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(np.eye(2) + aa - 1e-12 * np.trace(aa) * np.eye(2))
+    for shift in (0.0, 1e-12):
+        draw = conditional_draw(ay, aa - shift * np.trace(aa) * np.eye(2), np.random.default_rng(0))
+        assert np.isfinite(draw).all()
+        assert np.sum(draw) == pytest.approx(0.7, rel=1e-3)

@@ -178,6 +178,8 @@ def logarithmic_decrement(
 ) -> Decrement | None:
     """Apply the paper's estimator to ``values``; None where fewer than three half cycles exceed the limits.
 
+    Three turning points with samples on either side take five samples.
+
     Parameters
     ----------
     time, values : (n,) s and m
@@ -185,6 +187,8 @@ def logarithmic_decrement(
     smoothed : (n,) the record after Savitzky–Golay, which locates the half cycles (default: ``values``)
     jumps : whether the readings may jump where the rod turns, as an acceleration does
     """
+    if len(values) < 5:
+        return None
     rest = equilibrium(values)
     guide = (values if smoothed is None else smoothed) - rest
     smallest = PEAK_RANGE_RATIO_OF_JUMPS if jumps else PEAK_RANGE_RATIO

@@ -508,6 +508,8 @@ class DecayRecord(Decay):
         return self.decrement(smooth) if is_even(self.condensed[0]) else None
 
     def _rough(self) -> Decrement:
+        if len(self.values) < UNKNOWNS:  # of a part of a record; of a whole one the kind demands more
+            raise ValueError("a decay has more unknowns than these readings")
         decrement = self.decrement()
         if decrement is not None and decrement.delta > 0.0:
             return decrement
