@@ -230,7 +230,7 @@ def test_a_random_decay_ends_with_a_verdict_or_is_refused(tmp_path: Path, seed: 
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", [1021, 1039])
+@pytest.mark.parametrize("seed", [1021, pytest.param(1039, marks=pytest.mark.slow)])
 def test_a_random_decay_is_sampled_to_its_verdict(tmp_path: Path, seed: int) -> None:
     """Three readings left for the paper's estimate, and readings without noise (before: a warning, an internal failure)."""
     outcome(tmp_path, seed, DEFAULT_BUDGET)
