@@ -84,6 +84,7 @@ def test_two_runs_agree_to_the_byte(here: Path) -> None:
     same_as_uninterrupted(here, "again")
 
 
+@pytest.mark.full
 def test_another_seed_gives_other_numbers(here: Path) -> None:
     fit_params([*WORDS, "--out", "other", "--seed", "1"])
     whole, other = (json.loads((here / name / "parameters.json").read_text()) for name in ("whole", "other"))

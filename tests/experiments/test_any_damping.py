@@ -302,6 +302,7 @@ def test_the_rest_of_an_overdamped_decay_is_not_clipped(tmp_path: Path) -> None:
     assert "readings.clipped" in {found.code for found in lint(rig, kinds, rig.tables)}
 
 
+@pytest.mark.full
 def test_no_start_is_proposed_that_leaves_too_few_samples(tmp_path: Path) -> None:
     """Swings with clipped peaks, whose last clipped sample stands before 3 samples, or before 11."""
     time = np.arange(1050) / 1000.0

@@ -166,6 +166,7 @@ def test_memory_grows_neither_with_particles_nor_with_readings(monkeypatch: pyte
     np.testing.assert_array_equal(values, points.log_likelihood(model, theta))
 
 
+@pytest.mark.full
 def test_groups_of_many_readings_say_what_the_readings_say(monkeypatch: pytest.MonkeyPatch) -> None:
     """Evidences in groups of neighbours, beside those of the readings one by one."""
     points = twin(4, 1200, CoulombStribeck(0.65, 1.0, 0.1))

@@ -39,6 +39,7 @@ def test_differences_agree_with_forward_derivatives(number: int, samples: int, e
     assert growth(make(number, samples=samples), theta(number) | WILD) == pytest.approx(exact, rel=0.01)
 
 
+@pytest.mark.full
 def test_a_factor_beyond_differences_is_extrapolated(monkeypatch: pytest.MonkeyPatch) -> None:
     """From the first instant above 1e4 of a record that reaches 8.6e7."""
     monkeypatch.setattr(predictability, "MEASURABLE", 1e4)

@@ -99,6 +99,7 @@ def test_a_creeping_start_is_told_from_rest_by_the_whole_record() -> None:
     assert found["x_start"] == pytest.approx(moving["x_start"], abs=5e-5)
 
 
+@pytest.mark.full
 def test_a_start_that_fits_stands() -> None:
     moving, stuck = (make(number, samples=600) for number in (0, 2))
     assert better_start(moving.remade(moving.table, capsule_rate=theta(0)["capsule_start"]), theta(0)) is None

@@ -156,6 +156,7 @@ def test_coloured_noise_is_quoted_from_fewer_readings_that_tell_as_much() -> Non
         assert abs(few.values[name] - all_of_them.values[name]) < 0.2 * all_of_them.errors[name]
 
 
+@pytest.mark.full
 def test_records_of_two_sampling_rates_keep_readings_in_every_period() -> None:
     """Noise of a correlation time that both records show. (Before: the block of the faster one left 0.5 a period.)"""
     made = []

@@ -62,6 +62,7 @@ def test_the_band_is_that_of_new_trials_in_new_sessions(result: Result, tmp_path
     np.testing.assert_allclose(sorted(points.y), sorted(measured / np.repeat(time, 3)))
 
 
+@pytest.mark.full
 def test_settings_of_other_duties_have_panels_of_their_own(result: Result, tmp_path: Path) -> None:
     """In any order of rows; a duty without trials has no points."""
     path = tmp_path / "settings.csv"

@@ -134,6 +134,7 @@ def test_a_failed_lane_has_no_derivative_and_leaves_the_others_theirs(cases: Cas
     assert np.isnan(gradient[1])
 
 
+@pytest.mark.full
 def test_second_derivatives_are_refused(cases: Cases) -> None:
     p, e, T = cases.one("fig6_k2_20")
 

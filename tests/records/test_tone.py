@@ -34,6 +34,7 @@ def test_standard_errors_are_calibrated(replicates: list[Harmonic]) -> None:
     assert offsets.mean() == pytest.approx(OFFSET, abs=4.0 * NOISE_SD / np.sqrt(len(TIME) * REPLICATES))
 
 
+@pytest.mark.full
 def test_the_scatter_is_at_the_cramer_rao_bound(replicates: list[Harmonic]) -> None:
     """Rife and Boorstyn's closed forms for a single tone of unknown frequency, real-valued, time from the first sample."""
     n, ratio, step = len(TIME), (NOISE_SD / AMPLITUDE) ** 2, TIME[1]
