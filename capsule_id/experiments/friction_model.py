@@ -111,7 +111,7 @@ class FrictionModel:
     def support_at(self, theta: ValuesBySymbol, gap: Any) -> dict[str, Any]:
         """k2, G and forces of ``CapsuleParameters`` at ``theta``, which has k2 or the leaves of ``contact``, or none."""
         own = {} if self.contact is None else {row.symbol: theta.get(row.symbol) for row in self.support("")}
-        if self.contact is None or None in own.values():
+        if self.contact is None or any(value is None for value in own.values()):
             return {"k2": theta.get("k2", 0.0), "G": gap}
         return {"k2": 0.0, "G": gap, "forces": (cast(Any, self.contact)(**own, **{GAP: gap}),)}
 

@@ -420,3 +420,11 @@ def test_a_contact_that_cannot_be_fitted_is_refused() -> None:
     ):
         with pytest.raises(InputError, match=words):
             cid.fit(rig, budget=None, contact=contact)  # type: ignore[arg-type]
+
+
+def test_a_contact_takes_batches_of_its_leaves() -> None:
+    """The draws of a posterior, an array for each leaf."""
+    draws = {"k_h": np.array([1e6, 2e6]), "p": np.array([1.5, 1.4])}
+    (force,) = FrictionModel(contact=Hertz).support_at(draws, 1e-3)["forces"]
+    np.testing.assert_allclose(force.elastic(1e-4), draws["k_h"] * 1e-4 ** draws["p"], rtol=1e-14)
+    assert FrictionModel(contact=Hertz).support_at({}, np.inf) == {"k2": 0.0, "G": np.inf}
