@@ -178,15 +178,16 @@ class FrictionModel:
         InputError
             At the first such parameter.
         """
-        rows = [] if self.contact is None else self.support("")
-        for row in (*self.parameters, *rows):
-            if known.get(row.symbol, row) != row or (row in rows and row.symbol in known):
-                raise InputError(
-                    f"a parameter of {self.contact.__name__ if row in rows and self.contact else self.law.__name__} must "
-                    "have a symbol of its own",
-                    f"{row.symbol}: {known[row.symbol].meaning}",
-                    "rename it",
-                )
+        clashes = [(self.law, known[row.symbol]) for row in self.parameters if known.get(row.symbol, row) != row]
+        taken = {**known, **{row.symbol: row for row in self.parameters}}
+        own = [] if self.contact is None else self.support("")
+        clashes += [(cast(type, self.contact), taken[row.symbol]) for row in own if row.symbol in taken]
+        for law, other in clashes:
+            raise InputError(
+                f"a parameter of {law.__name__} must have a symbol of its own",
+                f"{other.symbol}: {other.meaning}",
+                "rename it",
+            )
 
     def force(self, theta: ValuesBySymbol) -> FrictionLaw:
         """The law at ``theta``, N; theta has m1, m2, g and, off level ground, slope and N0; or N."""

@@ -422,6 +422,29 @@ def test_a_contact_that_cannot_be_fitted_is_refused() -> None:
             cid.fit(rig, budget=None, contact=contact)  # type: ignore[arg-type]
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Constant(Force):
+    """A contact whose force has the symbol of a parameter of ``Lorentzian``."""
+
+    F_s: float
+    G: float
+
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("F_s", "N", "force of the contact", "F_s", Prior("lognormal", 3.0, 5.0)),
+        Hertz.parameters[-1],
+    )
+
+
+def test_a_contact_and_a_law_have_symbols_of_their_own() -> None:
+    """Before: one value served two unrelated parameters."""
+    with pytest.raises(
+        InputError, match="a parameter of Constant must have a symbol of its own, F_s: break-away force"
+    ):
+        FrictionModel(Lorentzian, contact=Constant).check({})
+    FrictionModel(Lorentzian, contact=Hertz).check({})
+
+
 def test_a_contact_takes_batches_of_its_leaves() -> None:
     """The draws of a posterior, an array for each leaf."""
     draws = {"k_h": np.array([1e6, 2e6]), "p": np.array([1.5, 1.4])}
