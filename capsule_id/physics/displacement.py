@@ -12,13 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
 
-from capsule_id.physics.batches import CHUNK, folded
+from capsule_id.physics.batches import CHUNK, folded, is_traced, run_lanes
 from capsule_id.physics.forces import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Drive, Status, without_absent
 from capsule_id.physics.simulation import simulate
 
 #: Periods of a block: short, because the motion is compared with its repetition only at the end of a block.
 BLOCK = 3
+#: Lanes of one call: so many that few wait for slower ones.
+TOGETHER = 1024
 #: The motion repeats where the state changes by less than this part of itself over one period, dimensionless.
 REPEATS = 1e-5
 #: Bound on the steps of a block, 300 per period. Plausible motions need 15 to 45 per period; a motion that needs far
@@ -66,10 +68,16 @@ def displacement(
 
     Works under ``jit`` and ``vmap``, and is differentiable in forward mode.
     """
-    p, e = without_absent(p, e)
-    lanes = jnp.shape(period)[0]
-    given = (p, e, law, r0, period, count)
-    return _run(*jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (lanes,)), given))
+    given = (*without_absent(p, e), law, r0, period, count)
+    lanes, xp = np.shape(period)[0], jnp if is_traced(given) else np
+    given = jax.tree.map(lambda leaf: xp.broadcast_to(xp.asarray(leaf, float), (lanes,)), given)
+    if xp is jnp:
+        return _run(*given)
+    # Lanes without periods fill the last part, so that one program serves any number of lanes.
+    *others, count = jax.tree.map(lambda leaf: np.pad(leaf, (0, -lanes % TOGETHER), "edge"), given)
+    count[lanes:] = 0.0
+    found = run_lanes(lambda *own: _run(*own[:-1], own[-1][:, 0]), tuple(others), count[:, None], True, TOGETHER)
+    return jax.tree.map(lambda leaf: leaf[:lanes], found)
 
 
 def _in_chunks(*given: Any) -> Displacement:

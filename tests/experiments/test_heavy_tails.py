@@ -12,7 +12,6 @@ from scipy.special import logsumexp
 
 from capsule_id.api import read_rig
 from capsule_id.experiments.kind import make_experiments
-from capsule_id.experiments.progression import experiment
 from capsule_id.experiments.progression.declaration import MOST_TRIALS, OUTLIER_SHARE, TIMES, alternatives
 from capsule_id.experiments.progression.density import MIDDLE, NODES, Sessions, TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.experiment import Progression
@@ -111,7 +110,7 @@ def test_an_outlying_trial_widens_nothing_else(tmp_path: Path) -> None:
 @pytest.mark.parametrize("tails", ["normal", "heavy"])
 def test_new_trials_have_the_tails_of_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tails: str) -> None:
     e = progression(tmp_path, tails)
-    monkeypatch.setattr(experiment, "batched", lambda *_: np.zeros((20_000, 3)))
+    monkeypatch.setattr(Progression, "displacements", lambda *_: np.zeros((20_000, 3)))
     draws = 20_000 * [{**THETA, "discrepancy": 0.0}]
     sd = np.hypot(THETA["trial_sd"], np.sqrt(e.reading_variance))
     z = e.new_trials(draws, e.settings, np.random.default_rng(0)) / sd

@@ -21,7 +21,7 @@ from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.tables import check_engine
 from capsule_id.inference.target import LogPosterior
-from capsule_id.physics.displacement import displacement
+from capsule_id.physics.displacement import TOGETHER
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.physics.simulation import simulate
@@ -152,19 +152,25 @@ def test_more_sessions_than_parameters_are_named(tmp_path: Path, sessions: int, 
     assert len(progression(tmp_path / "rig").sessions.symbols) == 8
 
 
-def test_new_values_need_no_new_program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_values_and_other_settings_need_no_new_program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     e, traced = progression(folder), []
 
-    def counted(*arguments: Any) -> Any:
-        traced.append(arguments)
-        return displacement(*arguments)
+    def counted(*given: Any, **words: Any) -> Any:
+        traced.append(given)
+        return simulate(*given, **words)
 
-    monkeypatch.setattr("capsule_id.experiments.progression.experiment.displacement", counted)
+    monkeypatch.setattr("capsule_id.physics.displacement.simulate", counted)
     before = e.responses({**THETA, "mu": 0.2})[0]
     traced.clear()  # The first program may be older than this test.
     after = e.responses({**THETA, "mu": 0.3})[0]
-    assert not traced
     assert np.all(np.asarray(before) != np.asarray(after))
+    draws = [{**THETA, "mu": mu} for mu in np.linspace(0.2, 0.3, 400)]
+    many = e.motions_of_draws(draws)
+    assert not traced
+    assert len(many) * many.shape[1] > TOGETHER
+    # Wherever a lane stands, it has the motion that it has alone.
+    for draw in (0, 171, 399):
+        np.testing.assert_array_equal(many[draw], e.motions_of_draws(draws[draw : draw + 1])[0])
 
 
 def test_without_a_column_a_session_is_a_block_of_equal_settings(folder: Path, tmp_path: Path) -> None:

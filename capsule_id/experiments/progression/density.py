@@ -17,7 +17,7 @@ from numpy.polynomial.hermite_e import hermegauss
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.misfit import LOG_2PI, Misfit
 from capsule_id.experiments.progression.declaration import SESSIONS, alternatives
-from capsule_id.physics.batches import pool
+from capsule_id.physics.batches import array_module, pool
 
 # sessions: Sessions of a progression: how the friction of each one enters, and the runs of the capsule that follow.
 #
@@ -91,9 +91,8 @@ class Sessions(eqx.Module):
         return tuple(row.symbol for row in SESSIONS[: self.own.shape[1]])
 
     def log_friction(self, theta: ValuesBySymbol) -> Any:
-        """(runs,) logarithm of what multiplies the friction."""
-        known = [theta[symbol] for symbol in self.symbols]
-        z = self.node + (self.own @ jnp.stack(known) if known else 0.0)
+        """(runs,) logarithm of what multiplies the friction; (draws, runs) where theta has (draws, 1) each."""
+        z = sum((theta[symbol] * own for symbol, own in zip(self.symbols, self.own.T, strict=True)), self.node)
         return theta["session_sd"] * z
 
     @property
@@ -103,15 +102,16 @@ class Sessions(eqx.Module):
 
     def responses(self, X2: Any) -> Any:
         """(..., cases, nodes) X2 of every case at ``NODES``, from (..., runs): beyond the outer runs linear."""
-        X = jnp.asarray(X2)[..., _index(self.at)]
-        outer = jnp.stack([2.0 * X[..., 1] - X[..., 2], 2.0 * X[..., 3] - X[..., 2]], axis=-1)
-        beyond = jnp.concatenate([outer[..., :1], X[..., INNER], outer[..., 1:]], axis=-1)
-        return jnp.where((jnp.asarray(self.shared) > 0.0).reshape(*(1,) * (X.ndim - 2), -1, 1), X, beyond)
+        xp = array_module(X2, self.shared)
+        X = xp.asarray(X2)[..., _index(self.at)]
+        outer = xp.stack([2.0 * X[..., 1] - X[..., 2], 2.0 * X[..., 3] - X[..., 2]], axis=-1)
+        beyond = xp.concatenate([outer[..., :1], X[..., INNER], outer[..., 1:]], axis=-1)
+        return xp.where((self.shared > 0.0).reshape(*(1,) * (X.ndim - 2), -1, 1), X, beyond)
 
 
 def _index(numbers: Any) -> Any:
     # The log-posterior stores all numbers of experiments as floats.
-    return jnp.asarray(numbers).astype(int)
+    return array_module(numbers).asarray(numbers).astype(int)
 
 
 def lines(X: Any, nodes: np.ndarray, xp: ModuleType = jnp) -> tuple[Any, Any]:

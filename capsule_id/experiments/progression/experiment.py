@@ -1,6 +1,6 @@
 """Likelihood of progressions: displacement of the capsule after a number of drive periods, from rest."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, cast
@@ -37,11 +37,11 @@ from capsule_id.experiments.progression.density import (
     parameters_of,
 )
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.physics.batches import pool
+from capsule_id.physics.batches import array_module
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import equilibrium, scaled
-from capsule_id.physics.model import CapsuleParameters, Drive, Excitation
+from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, without_absent
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
@@ -73,35 +73,6 @@ def session_table(experiments: "Sequence[Progression]", fit: Fitted) -> list[Res
                 }
             )
     return [ResultTable("progression.sessions", pd.DataFrame(rows).set_index("parameter").round(4))] if rows else []
-
-
-# batches: Functions of many draws of the parameters, in compiled batches on all cores.
-
-
-#: Draws of one compiled batch.
-DRAWS_OF_A_BATCH = 16
-
-
-def batched(function: Callable[..., Any], draws: Sequence[ValuesBySymbol], s: np.ndarray) -> np.ndarray:
-    """``function(theta, s)`` at every draw and row of ``s``, in batches of one size, on all cores; no s: ``function(theta)``.
-
-    ``function`` is a tree (``eqx.Partial``), so that all experiments of one structure share its program.
-    """
-    symbols = tuple(name for name in draws[0] if np.ndim(draws[0][name]) == 0)
-    rows = np.concatenate([np.array([[draw[name] for name in symbols] for draw in draws]), s], axis=1)
-    padded = np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % DRAWS_OF_A_BATCH, axis=0)])
-    parts = np.split(padded, len(padded) // DRAWS_OF_A_BATCH)
-    found = pool().map(lambda part: np.asarray(_of_rows(function, symbols, part)), parts)
-    return np.concatenate(list(found))[: len(rows)]
-
-
-@eqx.filter_jit
-def _of_rows(function: Callable[..., Any], symbols: tuple[str, ...], rows: Any) -> Any:
-    def one(row: Any) -> Any:
-        theta, s = dict(zip(symbols, row[: len(symbols)], strict=True)), row[len(symbols) :]
-        return function(theta, s) if s.size else function(theta)
-
-    return jax.vmap(one)(rows)
 
 
 # checks: Check of a fitted progression: how much of the motion the model leaves unexplained.
@@ -151,6 +122,13 @@ SESSION_STEP = 0.1
 BAND_DRAWS = 200
 #: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
 DAMPING_RATIO, FRICTION = 0.1, 0.3
+
+
+def columns_of(draws: Sequence[ValuesBySymbol]) -> dict[str, np.ndarray]:
+    """Draws of the parameters as one value each, (draws, 1)."""
+    return {
+        name: np.array([draw[name] for draw in draws])[:, None] for name in draws[0] if np.ndim(draws[0][name]) == 0
+    }
 
 
 class Progression(CapsuleForward):
@@ -290,24 +268,35 @@ class Progression(CapsuleForward):
         )
 
     def runs(self, theta: ValuesBySymbol) -> Any:
-        """(runs,) X2 of the runs of ``sessions``, m."""
-        if self.emulator is not None:
-            return self.emulator(theta)
-        settings = jnp.asarray(self.settings)[self.sessions.setting_of_run]
-        return self.displacements(theta, self.sessions.log_friction(theta), settings)
+        """(..., runs) X2 of the runs of ``sessions``, m, by the exact or the smoothed engine; see ``displacements``."""
+        return self.displacements(theta, self.sessions.log_friction(theta), self.settings[self.sessions.setting_of_run])
 
     def responses(self, theta: ValuesBySymbol) -> Any:
         """(cases, nodes) X2, m; see ``Sessions.responses``."""
-        return self.sessions.responses(self.runs(theta))
+        return self.sessions.responses(self.runs(theta) if self.emulator is None else self.emulator(theta))
 
     def displacements(self, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
-        """X2, m, at rows of ``settings`` (rows, 4) with friction multiplied by exp(s), s (rows,)."""
-        # Numbers that are no arrays would be constants of the program: each new point would compile it anew.
-        return _displacements(self, {name: jnp.asarray(x) for name, x in theta.items()}, s, settings)
+        """X2, m, at rows of ``settings`` (rows, 4) with friction multiplied by exp(s).
+
+        Parameters
+        ----------
+        theta : () each, with s (rows,); or (draws, 1) each, with s (draws, rows)
+        """
+        p, drive = without_absent(*self.capsule(theta, settings))
+        r0, xp = equilibrium(p) if "slope" in self.ground else 0.0, array_module(s)
+        given = (p, drive, scaled(self.law(theta), xp.exp(s)), r0, settings[:, 0], settings[:, 1])
+        lanes = jax.tree.map(lambda leaf: xp.broadcast_to(xp.asarray(leaf, float), s.shape).ravel(), given)
+        p, drive, law, r0, period, count = lanes
+        if self.smoothing is None:
+            return displacement(p, drive, law, period, count, r0).X2.reshape(s.shape)
+        times = xp.stack([xp.zeros_like(period), period * count], axis=1)
+        rest = (r0, 0.0, 0.0, 0.0)
+        t = simulate(p, drive, times, rest, model="smooth", smoothing=self.smoothing, friction=law)
+        return t.X2[:, 1].reshape(s.shape)
 
     def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
-        """The numbers of every draw for which the likelihood runs the capsule; not finite where a run fails."""
-        return batched(eqx.Partial(Progression.runs, self), draws, np.zeros((len(draws), 0)))
+        """(draws, runs) X2 for which the likelihood runs the capsule; not finite where a run fails."""
+        return np.asarray(self.runs(columns_of(draws)))
 
     def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: np.ndarray) -> "Progression":
         """Return the same trials with an emulator of the motions, fitted to ``motions_of_draws`` of ``draws``."""
@@ -402,8 +391,8 @@ class Progression(CapsuleForward):
         """
         time = settings[:, 0] * settings[:, 1]
         z = rng.standard_normal((3, len(draws), len(settings)))
-        own = {name: np.array([draw[name] for draw in draws])[:, None] for name in ("session_sd", *OF_TRIALS)}
-        X2 = batched(eqx.Partial(Progression.displacements, self, settings=settings), draws, own["session_sd"] * z[0])
+        own = columns_of(draws)
+        X2 = np.asarray(self.displacements(own, own["session_sd"] * z[0], settings))
         variance = self.reading_variance + own["trial_sd"] ** 2 + (own["trial_scatter"] * X2) ** 2
         if self.heavy:
             variance = np.where(rng.uniform(size=variance.shape) < OUTLIER_SHARE, TIMES**2, 1.0) * variance
@@ -482,16 +471,3 @@ class Progression(CapsuleForward):
         limits = band(trials * speed if chosen else trials)
         residuals = np.asarray(self.residuals(theta, np))[: self.n]
         return self.speed_panels(settings, centre, limits, "this fit, 95 % band of a new trial", residuals)
-
-
-@eqx.filter_jit
-def _displacements(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
-    p, drive = e.capsule(theta, settings)
-    law = scaled(e.law(theta), jnp.exp(s))
-    r0 = equilibrium(p) if "slope" in e.ground else 0.0
-    period, count = settings[:, 0], settings[:, 1]
-    if e.smoothing is None:
-        return displacement(p, drive, law, period, count, r0).X2
-    times = jnp.stack([jnp.zeros_like(period), period * count], axis=1)
-    rest = (r0 + jnp.zeros_like(period), 0.0, 0.0, 0.0)
-    return simulate(p, drive, times, rest, model="smooth", smoothing=e.smoothing, friction=law).X2[:, 1]
