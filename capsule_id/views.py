@@ -145,7 +145,7 @@ class Curve:
     y: np.ndarray
     lower: np.ndarray | None = None
     upper: np.ndarray | None = None
-    role: Literal["ours", "paper", "predictive", "alternative"] = "ours"
+    role: Literal["ours", "paper", "alternative"] = "ours"
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from capsule_id.errors import InputError, writing
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.output import as_utf8, write_file
-from capsule_id.parameters import TABLE
+from capsule_id.parameters import TABLE, Name
 from capsule_id.report.columns import columns_of, errors_left_out
 from capsule_id.report.figures.style import own_style
 from capsule_id.report.html import pictures, render
@@ -316,7 +316,7 @@ def data_tree(result: Result) -> xr.DataTree:
     Raises
     ------
     ValueError
-        If nothing was sampled, or a name is used both alone and as a family.
+        If nothing was sampled.
     """
     posterior, pointwise = result.posterior, result.pointwise
     if posterior is None:
@@ -424,19 +424,20 @@ def _readings(by_label: Mapping[str, np.ndarray], leading: tuple[str, ...]) -> x
 
 
 def _families(arrays: Mapping[str, np.ndarray], units: Mapping[str, str], fixed: Container[str] = ()) -> xr.Dataset:
-    """Variables (chain, draw) by name; names with brackets are stacked along the dimension of their family."""
+    """Variables (chain, draw) by name; names with brackets are stacked along the dimension of their family.
+
+    There "" is the one without a bracket: the slope of the rig beside that of one table.
+    """
     families: defaultdict[str, dict[str, np.ndarray]] = defaultdict(dict)
     for name, values in arrays.items():
-        base, _, of = name.partition("[")
-        families[base][of[:-1]] = values
+        base, of = Name.parse(name)
+        families[base][of] = values
     dataset = xr.Dataset()
     for base, members in families.items():
-        names = [f"{base}[{of}]" if of else base for of in members]
-        if base in names and len(names) > 1:
-            raise ValueError(f"{base} is used both alone and as a family: {', '.join(names)}; rename one of them")
+        names = [str(Name(base, of)) for of in members]
         # A symbol has one unit, so the first member's holds for all.
         about = {"units": units.get(names[0], ""), **({"fixed": 1} if all(name in fixed for name in names) else {})}
-        if base in names:
+        if names == [base]:
             dataset[base] = (("chain", "draw"), members[""], about)
         else:
             dimension = _DIMENSIONS.get(base, f"{base}_of")
@@ -454,7 +455,7 @@ def _members_of(dataset: xr.Dataset) -> dict[str, np.ndarray]:
             found[str(base)] = values
         else:
             members = variable[variable.dims[-1]].to_numpy()
-            found |= {f"{base}[{of}]": values[..., i] for i, of in enumerate(members)}
+            found |= {str(Name(str(base), of)): values[..., i] for i, of in enumerate(members)}
     return found
 
 

@@ -9,12 +9,11 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, refit
+from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, further_columns, refit
 from capsule_id.experiments.context import Check, Fitted
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (
     check_hidden_terms,
-    further_columns,
     sensitivities,
     zero_jumps,
 )
@@ -38,8 +37,6 @@ INTERVALS, READINGS_PER_INTERVAL = 12, 5
 FAST_DRIFT = 0.01
 #: Largest part of a drift that is as fast as the motion, relative to the residuals left: about half of what white noise gives.
 FAST_NOISE = 0.25
-#: Distance from 0, in sds, of a force that a second fit has found and that counts as seen.
-FARTHER = 3.0
 #: Smallest ratio of the residuals of the larger half of the amplitudes to those of the smaller half that counts.
 LARGER = 1.3
 #: Steps of the readings in which a motion is lost, and fewest readings before that.
@@ -164,7 +161,7 @@ def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Find
             (symbol,),
         )
         for symbol, e in found.items()
-        if z[symbol] < FARTHER
+        if z[symbol] < DISAGREE
     ]
 
 
@@ -257,8 +254,8 @@ def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | Non
         offsets += [ahead & (place == i) for i in range(number)]
         limits += list(itertools.pairwise(edges))
     known = np.column_stack([design, *moved.values()])
-    p, effects = further_columns(*(e.whitened(theta, x) for x in (known, np.stack(offsets, axis=1), left)))
-    if p is None:
+    _, p, effects = further_columns(*(e.whitened(theta, x) for x in (known, np.stack(offsets, axis=1), left)))
+    if np.isnan(p):
         return None
     low, high = np.array(limits[np.argmax(np.abs(effects))]) * e.column.to_display
     return {"p": p, "low": float(low), "high": float(high), "unit": e.column.unit, **later_start(e)}, p

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lsim
 
-from capsule_id.experiments.base import ValuesBySymbol, stretch
+from capsule_id.experiments.base import ValuesBySymbol, stretch, without
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
@@ -29,8 +29,6 @@ from capsule_id.views import Facts, Finding, Level
 SENSITIVITY_STEP, SMALLEST_C = 1e-5, 0.01
 #: Points per period, and fewest points, of the responses to further forces.
 RESPONSE_POINTS, FEWEST_POINTS = 60, 200
-#: Directions of further columns that are shorter than this, relative to the longest one, are combinations of the others.
-COMBINATION = 1e-8
 
 
 def sensitivities(
@@ -78,32 +76,6 @@ def force_responses(e: DecayRecord, theta: Mapping[str, float]) -> dict[str, np.
             response = np.gradient(response, grid[1])
         found[name] = np.interp(time, grid, response)
     return found
-
-
-def further_columns(known: np.ndarray, further: np.ndarray, left: np.ndarray) -> tuple[float | None, np.ndarray]:
-    """F test for the columns ``further`` (n, q) beside those ``known`` (n, p), and the effect (q,) of each of them.
-
-    Returns
-    -------
-    p-value, None for too few readings; correlation of the residuals ``left`` (n,) with each column, times their length. What
-    the known columns take up is projected out of both. Columns that are combinations of others count once.
-    """
-    own, columns = without(known, left, further)
-    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    basis = basis[:, sizes > COMBINATION * sizes[0]]
-    effects = columns.T @ own / np.maximum(np.linalg.norm(columns, axis=0), COMBINATION)
-    rank, freedom = basis.shape[1], len(own) - np.count_nonzero(known.any(axis=0)) - basis.shape[1]
-    if freedom < rank:
-        return None, effects
-    explained = float(np.sum((basis.T @ own) ** 2))
-    return float(stats.f.sf(explained / rank * freedom / (float(own @ own) - explained), rank, freedom)), effects
-
-
-def without(known: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
-    """What the columns ``known`` (n, p) leave of each of ``parts``, (n,) or (n, q)."""
-    size = np.linalg.norm(known, axis=0)
-    basis = np.linalg.qr(known[:, size > 0.0] / size[size > 0.0])[0]
-    return [part - basis @ (basis.T @ part) for part in parts]
 
 
 def _units(e: Decay, theta: Mapping[str, float]) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from functools import partial
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -40,10 +39,10 @@ class Motion(NamedTuple):
     acceleration: Any
 
 
-def rates(k1: Any, c: Any, m1: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
+def rates(k1: Any, c: Any, m1: Any) -> tuple[Any, Any]:
     """Decay rate gamma, 1/s, and frequency omega, rad/s (NaN where overdamped)."""
     gamma = c / (2.0 * m1)
-    return gamma, xp.sqrt(k1 / m1 - gamma**2)
+    return gamma, jnp.sqrt(k1 / m1 - gamma**2)
 
 
 class HalfCycles(NamedTuple):

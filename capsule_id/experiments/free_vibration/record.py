@@ -72,6 +72,7 @@ from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.release import shortened
 from capsule_id.records.tones import noise_level
+from capsule_id.records.view import FILTER_ORDER
 from capsule_id.rig.filters import choose_window, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Facts, Points
@@ -173,8 +174,6 @@ def averaged_process(times: ReadingTimes, correlation_time: Any) -> SymmQSM:
 
 #: Twice the damping ratio up to which an even record is summed in closed form.
 UNIFORM = 0.6
-#: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
-SMOOTHING_ORDER = 3
 #: Latest first turning point after the first sample, in half periods.
 LATEST_TURNING_POINT = 0.1
 #: A rough viscous fit whose residuals are this many times the noise misses a force.
@@ -310,7 +309,7 @@ class Decay(SurfaceExperiment):
             (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
             time,
             residuals,
-            autocorrelation(residuals, min(60, self.n // 4)) if self.time_series else None,
+            autocorrelation(residuals) if self.time_series else None,
             1.96 / float(np.sqrt(self.n)) if self.time_series else None,
         )
 
@@ -495,8 +494,8 @@ class DecayRecord(Decay):
         time, values = self.condensed
         if not is_even(time):
             return values
-        window = self.table.settings.smoothing_window or choose_window(time, values, SMOOTHING_ORDER)
-        return savitzky_golay(time, values, window, SMOOTHING_ORDER)
+        window = self.table.settings.smoothing_window or choose_window(time, values, FILTER_ORDER)
+        return savitzky_golay(time, values, window, FILTER_ORDER)
 
     def decrement(self, smooth: bool = True) -> Decrement | None:
         """Return peaks and logarithmic decrement, from the smoothed or the raw record; None with too few peaks."""

@@ -12,10 +12,11 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.experiments.base import LEVEL, Start, ljung_box, refit
+from capsule_id.experiments.base import LEVEL, Start, further_columns, ljung_box, refit
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, equilibrium, viscous_fit
-from capsule_id.experiments.free_vibration.hidden_terms import force_responses, further_columns
+from capsule_id.experiments.free_vibration.hidden_terms import force_responses, sensitivities
 from capsule_id.experiments.free_vibration.models import (
+    STEPS,
     HalfCycles,
     half_cycles,
     interpolate,
@@ -130,8 +131,6 @@ def starts_of_motion(e: DecayRecord, rough: Decrement) -> dict[str, Start]:
 
 #: Largest number of evaluations in a fit, and relative step of its difference quotients.
 EVALUATIONS, STEP = 40, 1e-5
-#: Most Runge–Kutta steps of a half cycle: x_rel is wrong by up to 5e-6 of the amplitude, which decides no ranking.
-STEPS = 12
 #: Distance of starts from the bounds, and of the start of a term that a nested model lacks.
 INSIDE, ABSENT_TERM = 1e-3, 1e-9
 #: Replaces the effect of an unknown that the record does not depend on.
@@ -176,7 +175,8 @@ def free_symbols(model: DecayModel) -> list[str]:
 @lru_cache(maxsize=32)
 def _paths(number: int) -> Callable[[Mapping[str, Any]], tuple[HalfCycles, Any]]:
     """Program for half cycles of a batch of parameters; it also returns a number without meaning."""
-    path = jax.vmap(partial(half_cycles, number=number, steps=min(STEPS, steps_of(number))))
+    # With half of the steps x_rel is wrong by up to 5e-6 of the amplitude, which decides no ranking.
+    path = jax.vmap(partial(half_cycles, number=number, steps=min(STEPS // 2, steps_of(number))))
     forces = ("k1", "c", "m1", "F_dry", "c_q", "k_cubic")
     return as_one_function(
         lambda theta: path({name: theta[name] for name in forces}, theta["amplitude"], theta["turning_time"])
@@ -455,17 +455,13 @@ def demands_another(record: DecayRecord, level: float) -> bool:
 
 def response_p(record: DecayRecord, theta: Mapping[str, float]) -> float:
     """p-value of the F test for the responses of the rod to further forces and for a drift, at a viscous fit."""
-    raw, design = record.unwhitened(theta, np)
-    parts = np.linalg.lstsq(design, raw, rcond=None)[0]
-    columns = force_responses(record, theta).values()
+    left, design, moved = sensitivities(record, theta, ("k1", "c"))
     relative = record.time / record.time[-1] - 0.5
-    extra = np.column_stack([*columns, relative, relative**2])
-    moved = [record.unwhitened({**theta, name: 1.001 * theta[name]}, np)[1] @ parts for name in ("k1", "c")]
-    known = np.column_stack([design, *(column - design @ parts for column in moved)])
+    extra = np.column_stack([*force_responses(record, theta).values(), relative, relative**2])
     # A column of zeros is no effect: quadratic damping of a record that stays where it is.
     extra = extra / np.maximum(np.linalg.norm(extra, axis=0), np.finfo(float).tiny)
-    p, _ = further_columns(known, extra, raw)
-    return 1.0 if p is None else p
+    p = further_columns(np.column_stack([design, *moved.values()]), extra, left)[1]
+    return 1.0 if np.isnan(p) else p
 
 
 def thinning(record: DecayRecord, per_period: float) -> int:

@@ -197,9 +197,7 @@ class Progression(CapsuleForward):
         self.set_model(table, rig, friction)
         self.emulator, self.drive = None, table.settings.drive
         self.reading_variance = table.columns["distance"].reading_sd ** 2
-        rows, self.amplitude_from = settings_of(
-            {name: column.values for name, column in table.columns.items()}, table.settings
-        )
+        rows, self.amplitude_from = settings_of(table.columns, table.settings)
         settings, index = np.unique(rows, axis=0, return_inverse=True)
         setting, session = np.eye(len(settings))[index], sessions_of(table, rows)
         self.heavy = table.settings.tails == "heavy"
@@ -383,7 +381,7 @@ class Progression(CapsuleForward):
 
     def settings_of(self, columns: Mapping[str, Column]) -> tuple[np.ndarray, np.ndarray]:
         """Settings in the rows of a table, (rows, 4), and the durations of their trials, (rows,) s."""
-        rows, _ = settings_of({name: column.values for name, column in columns.items()}, self.table.settings)
+        rows, _ = settings_of(columns, self.table.settings)
         return rows, rows[:, 0] * rows[:, 1]
 
     def setting_names(self) -> list[str]:

@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from capsule_id.experiments.context import RunRecord
 from capsule_id.inference.result import PointFit
+from capsule_id.parameters import QUANTILE_975
 from capsule_id.records.view import MotionView
 from capsule_id.report.columns import SampledParameters, plain_symbol
 from capsule_id.report.figures.style import (
@@ -25,6 +26,7 @@ from capsule_id.report.figures.style import (
     CYCLE,
     GREEN,
     GREY,
+    MM,
     ORANGE,
     PALE_BLUE,
     PURPLE,
@@ -45,9 +47,8 @@ from capsule_id.views import Comparison, Curve, Finding, Points
 # comparisons: Measured beside predicted: the panels of a ``Comparison``, and where the point fit's starts ended.
 
 
-# Beyond this many points a record is a cloud of dots, not single readings with bars.
+# Beyond this many points a record is a cloud of dots or a line, not single readings with bars or markers.
 _MANY = 100
-TWO_SIDED_95 = 1.96
 
 _POINT_STYLES: dict[str, dict[str, Any]] = {
     "static": {"marker": "o", "mfc": "none", "color": BLACK},
@@ -58,7 +59,6 @@ _POINT_STYLES: dict[str, dict[str, Any]] = {
 _CURVE_STYLES: dict[str, dict[str, Any]] = {
     "ours": {"color": BLUE, "ls": "-", "lw": 1.8},
     "paper": {"color": VERMILION, "ls": "--", "lw": 1.6},
-    "predictive": {"color": GREEN, "ls": "-.", "lw": 1.6},
     "alternative": {"color": PURPLE, "ls": ":", "lw": 2.0},
 }
 
@@ -87,7 +87,7 @@ def residuals(item: Comparison, ax: Axes) -> None:
     if item.residuals is None or item.residual_x is None:
         raise ValueError(f"{item.label} has no residuals")
     many = item.residuals.size > _MANY
-    _about_zero(ax, TWO_SIDED_95, 1.1 * max(3.0, _largest(item.residuals)))
+    _about_zero(ax, QUANTILE_975, 1.1 * max(3.0, _largest(item.residuals)))
     ax.plot(item.residual_x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
     set_text(ax, item.x_label, "residual / sd [1]")
 
@@ -217,8 +217,6 @@ def _draw_points(ax: Axes, points: Points) -> None:
 # readings: Figures of the readings of one experiment with what ``capsule-id check`` found in them.
 
 
-#: A record with more samples than this is a line without markers.
-MOST_MARKERS = 200
 #: Marks of rows that findings name: code, words of the legend, marker, colour.
 _MARKS = (
     ("readings.clipped", "clipped", "v", VERMILION),
@@ -257,7 +255,7 @@ def channel_with_findings(table: Table[Any], name: str, findings: Sequence[Findi
     y = _displayed(table, name)
     x = _displayed(table, across) if across else np.arange(1.0, len(y) + 1.0)
     record = "time" in table.columns
-    marker = "" if record and len(y) > MOST_MARKERS else "o"
+    marker = "" if record and len(y) > _MANY else "o"
     ax.plot(x, y, color=BLUE, lw=0.8 if record else 0.0, marker=marker, ms=3.5, label="readings")
     if record:
         _mark_times(table, findings, ax)
@@ -297,11 +295,10 @@ def _displayed(table: Table[Any], name: str) -> np.ndarray:
 # force (4d).
 
 
-_MM = 1e3
 # Channels in the order of the panels: axis label, display per SI, colour.
 _CHANNELS = {
-    "x_capsule": ("X2, mm", _MM, BLACK),
-    "x_rel": ("X1 - X2, mm", _MM, BLUE),
+    "x_capsule": ("X2, mm", MM, BLACK),
+    "x_rel": ("X1 - X2, mm", MM, BLUE),
     "acceleration_rod": ("acceleration\nof the rod, m/s²", 1.0, GREY),
     "current": ("current, A", 1.0, PURPLE),
 }
@@ -311,16 +308,16 @@ def phase_plane(view: MotionView, ax: Axes) -> None:
     """Rate against x_rel, with the impact line and the Poincaré points at the drive's phase."""
     # At the ends of a filtered record the derivative is that of a polynomial's edge, and mostly noise.
     inside = slice(view.samples // 2, len(view.time) - view.samples // 2)
-    ax.plot(_MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
+    ax.plot(MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
     recorded = view.label != ""
     lines = []
     if np.isfinite(view.gap):
         words = "gap as stated" if recorded else "impact line"
-        lines.append(ax.axvline(_MM * view.gap, color=VERMILION, ls="--", lw=1.2, label=words))
+        lines.append(ax.axvline(MM * view.gap, color=VERMILION, ls="--", lw=1.2, label=words))
     if view.gap_seen is not None:
-        lines.append(ax.axvline(_MM * view.gap_seen, color=VERMILION, ls=":", lw=1.6, label="contacts begin"))
+        lines.append(ax.axvline(MM * view.gap_seen, color=VERMILION, ls=":", lw=1.6, label="contacts begin"))
     look: dict[str, Any] = {"marker": "o", "ms": 4.5, "color": GREEN, "zorder": 3, "label": "once a period"}
-    ax.plot(_MM * view.section_x_rel, view.section_rate, ls="none", **look)
+    ax.plot(MM * view.section_x_rel, view.section_rate, ls="none", **look)
     words = ("rate of X1 - X2, m/s", f"motion: {view.label}") if recorded else ("Y1 - Y2, m/s", "")
     set_text(ax, "X1 - X2, mm", *words)
     below_legend = set_legend(ax, "upper right")
@@ -478,13 +475,11 @@ def traces(columns: SampledParameters, figure: Figure | SubFigure) -> None:
     for i, panel in enumerate(axes.flat[:n]):
         for e, ensemble in enumerate(shown[..., i]):
             panel.plot(step, ensemble, color=CYCLE[e % len(CYCLE)], lw=0.6, alpha=0.8)
-        panel.set_ylabel(f"{columns.symbols[i]} [{columns.units[i]}]", fontsize=SMALL, parse_math=False)
-        panel.tick_params(labelsize=SMALL, length=3)
+        lowest = i + 2 >= n  # of its column; over an empty place too
+        words = "step after burn-in [1]" if lowest else "", f"{columns.symbols[i]} [{columns.units[i]}]"
+        set_text(panel, *words, size=SMALL)
+        panel.tick_params(labelbottom=lowest)
         panel.yaxis.set_major_locator(MaxNLocator(3))
         panel.ticklabel_format(axis="y", useOffset=False, style="plain")
-        panel.spines[["top", "right"]].set_visible(False)
         panel.margins(x=0.01)
-        if i + 2 >= n:  # the lowest of its column; over an empty place too
-            panel.tick_params(labelbottom=True)
-            panel.set_xlabel("step after burn-in [1]", fontsize=TEXT)
     figure.align_ylabels()
