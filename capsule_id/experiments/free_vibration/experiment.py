@@ -362,4 +362,4 @@ class FreeVibration(DecayRecord):
     def noise_facts(self) -> Facts:
         facts = {"present": self.model.additions, "second": self.replaced, "lines": self.lines}
         facts |= {"tone": other_tone(self.time, self.values)}
-        return {"model": "decay", "stated": self.stated_words, **facts, **self.damping_trend(), **later_start(self)}
+        return {"model": "decay", "stated": self.stated_words, **facts, **later_start(self)}

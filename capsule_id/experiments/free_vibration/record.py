@@ -39,7 +39,6 @@ from capsule_id.experiments.free_vibration.decrement import (
     damping_of_peaks,
     equilibrium,
     logarithmic_decrement,
-    trend,
     viscous_basis,
     viscous_fit,
 )
@@ -75,7 +74,7 @@ from capsule_id.records.tones import noise_level
 from capsule_id.records.view import FILTER_ORDER
 from capsule_id.rig.filters import choose_window, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Curve, Facts, Points
+from capsule_id.views import Comparison, Curve, Points
 
 # noise: Coloured noise and drift of a record, at any sampling, whitened in linear time.
 #
@@ -544,9 +543,3 @@ class DecayRecord(Decay):
     @property
     def cycles(self) -> np.ndarray:
         return self.time * self.rough.Omega_o / (2.0 * np.pi)
-
-    def damping_trend(self) -> Facts:
-        """Drift of damping and frequency of the peaks with amplitude, see ``trend``; empty without drift."""
-        decrement = self.decrement()
-        facts = {} if decrement is None else trend(decrement, noise_level(self.values))
-        return facts and {**facts, "amplitude": tuple(self.deflection * size for size in facts["amplitude"])}
