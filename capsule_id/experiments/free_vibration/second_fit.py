@@ -216,28 +216,23 @@ class Screening:
     """
 
     def __init__(self, record: DecayRecord, thin: int | None = None, k1: float | None = None) -> None:
-        rough = record.rough
+        self.record, self.c, self.omega = record, record.rough.c, record.rough.Omega_o
         self.turning_time, peak = record.first_turning_point()
-        self.side, self.size = float(np.sign(peak)), abs(peak)
-        self.m1, self.k1, self.c, self.omega = record.mass, k1 or rough.k1, rough.c, rough.Omega_o
-        self.period = 2.0 * np.pi / self.omega
-        self.order = record.order
-        blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
-        self.values, self.nodes, self.weights = blocks.values, blocks.nodes, blocks.weights
-        self.times = ReadingTimes.of(blocks)
+        self.side, self.period = float(np.sign(peak)), 2.0 * np.pi / self.omega
+        self.blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
+        self.times = ReadingTimes.of(self.blocks)
         self.number = most_half_cycles(float(record.time[-1]), self.omega)
-        self.units = natural_units(self.k1, self.m1, self.size) | {
-            "k1": self.k1,
+        k1 = k1 or record.rough.k1
+        self.units = natural_units(k1, record.mass, abs(peak)) | {
+            "k1": k1,
             "c": self.c,
-            "amplitude": self.size,
+            "amplitude": abs(peak),
             "turning_time": 1.0 / self.omega,
             "noise_time": 0.1 * self.period,
             "white_ratio": 1.0,
             "drift_ratio": 1.0,
             "drift_time": self.period,
         }
-        self.rough_damping = record.rough_damping
-        self.mean_peak = record.deflection * float(np.mean(np.abs(rough.peaks)))
 
     def theta(self, z: np.ndarray) -> dict[str, Any]:
         """Values by symbol, SI, of scaled unknowns (..., names)."""
@@ -246,7 +241,7 @@ class Screening:
         values["turning_time"] = self.turning_time + values["turning_time"]
         for name in ("white_ratio", "drift_ratio"):
             values[name] = np.where(own[name] < BOUNDS[name][0], 0.0, values[name])
-        return {"m1": np.broadcast_to(self.m1, values["k1"].shape), **values}
+        return {"m1": np.broadcast_to(self.record.mass, values["k1"].shape), **values}
 
     def scaled(self, values: Mapping[str, float]) -> np.ndarray:
         """(names,) scaled unknowns at values by symbol, SI, of another fit; amplitude and time of this record's own."""
@@ -255,7 +250,7 @@ class Screening:
 
     def start(self, model: DecayModel, near: np.ndarray | None, absent: bool = False) -> np.ndarray:
         """(names,) scaled starting values; terms that the model lacks are switched off, ``absent`` those ``near`` lacks too."""
-        z = self.scaled(self.rough_damping(model.symbols)) if near is None else near.copy()
+        z = self.scaled(self.record.rough_damping(model.symbols)) if near is None else near.copy()
         free = free_symbols(model)
         for name, value in (("F_dry", 0.02), ("c_q", 0.05), ("k_cubic", 0.0), ("drift_time", 1.0)):
             i = NAMES.index(name)
@@ -279,11 +274,12 @@ class Screening:
         """
         i, j = NAMES.index("F_dry"), NAMES.index("c")
         found = self.theta(start)
-        known = "F_dry" in self.rough_damping(("F_dry",))
+        known = "F_dry" in self.record.rough_damping(("F_dry",))
         size, low, high = (found["F_dry"], 0.5, 2.0) if known else (self.units["F_dry"], 0.003, 0.45)
         grid = size * np.geomspace(low, high, len(NAMES) + 1)
         lost = (found["F_dry"] if known else 0.0) - grid
-        c = np.maximum(found["c"] + lost * 4.0 / (np.pi * self.omega * self.mean_peak), 0.02 * self.c)
+        peak = self.record.deflection * float(np.mean(np.abs(self.record.rough.peaks)))
+        c = np.maximum(found["c"] + lost * 4.0 / (np.pi * self.omega * peak), 0.02 * self.c)
         starts = np.tile(start, (len(grid), 1))
         starts[:, i], starts[:, j] = grid / self.units["F_dry"], np.log(c / self.c)
         moved = np.repeat(starts[None], DRY_ROUNDS, axis=0)
@@ -306,12 +302,15 @@ class Screening:
         """
         start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
         jacobians: dict[bytes, np.ndarray] = {}
-        unit = float(np.std(self.values))
+        unit = float(np.std(self.blocks.values))
 
         def whitened(whole: np.ndarray) -> np.ndarray:
             """(names + 1, n) residuals at as many scaled unknowns."""
             thetas, motion = self.motions(whole)
-            return np.asarray(_whitened(self.times, self.values - motion, thetas, model.drift == "linear")[0]) / unit
+            return (
+                np.asarray(_whitened(self.times, self.blocks.values - motion, thetas, model.drift == "linear")[0])
+                / unit
+            )
 
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
@@ -351,17 +350,17 @@ class Screening:
         _, first, place = np.unique(whole[:, : ROWS - 1], axis=0, return_index=True, return_inverse=True)
         parts = np.resize(first, (-(-len(first) // ROWS), ROWS))
         paths = (_paths(self.number)({name: x[part] for name, x in thetas.items()})[0] for part in parts)
-        readings = [_readings(path, self.nodes, self.weights, self.order) for path in paths]
+        readings = [_readings(path, self.blocks.nodes, self.blocks.weights, self.record.order) for path in paths]
         return thetas, self.side * np.concatenate(readings)[np.ravel(place)]
 
     def drowned(self, z: np.ndarray) -> bool:
         """Whether drift and noise at scaled unknowns (names,) are larger than the motion."""
         motion = self.motions(z[None])[1][0]
-        return not np.std(self.values - motion) <= np.std(motion)
+        return not np.std(self.blocks.values - motion) <= np.std(motion)
 
     def drift(self, z: np.ndarray) -> float:
         """Range of the mean over one period of measured minus predicted readings, SI, at scaled unknowns (names,)."""
-        raw = self.values - self.motions(z[None])[1][0]
+        raw = self.blocks.values - self.motions(z[None])[1][0]
         time = self.times.time
         half = 0.5 * self.period
         first, last = np.searchsorted(time, time - half), np.searchsorted(time, time + half)
@@ -380,7 +379,7 @@ class Screening:
     ) -> Screened:
         """Estimates at the end ``found`` of a fit, at the scaled unknowns ``z`` (names,); ``unit`` of its residuals."""
         free = free_symbols(model)
-        n, unknowns = len(self.values), len(free) + 2 + int(model.drift == "linear")
+        n, unknowns = len(self.blocks.values), len(free) + 2 + int(model.drift == "linear")
         deviance = n * (np.log(2.0 * found.cost * unit**2 / n) + 1.0 + LOG_2PI)
         values = {name: float(value) for name, value in self.theta(z).items()}
         norms = np.linalg.norm(found.jac, axis=0)
