@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol, clock_parameters, scatter_prior, stretch
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
+from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.record import DecayRecord
-from capsule_id.experiments.free_vibration.second_fit import starts_of_motion
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
     FrictionModel,
@@ -184,8 +184,13 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         return super().unstated_errors(symbol) | {"gain"}
 
     def starts(self) -> dict[str, Start]:
-        starts = super().starts() | starts_of_motion(self, self.rough)
-        return starts | stated_starts(self.label, G=self.table.settings.gap)
+        size, rate = abs(float(self.rough.peaks[0])), np.polyfit(self.time[:5], self.values[:5], 1)[0]
+        return {
+            **super().starts(),
+            f"x_start[{self.label}]": Start(float(self.values[0] - equilibrium(self.values)), 0.02 * size),
+            f"y_start[{self.label}]": Start(float(rate), 0.05 * self.rough.Omega_o * size),
+            **stated_starts(self.label, G=self.table.settings.gap),
+        }
 
 
 class CapsulePushes(CapsuleForward, DynamicFriction):

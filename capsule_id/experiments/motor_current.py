@@ -26,23 +26,15 @@ class MotorSettings(Settings):
     sd_ratio: Annotated[float | None, QuantityRule("N/A")] = None
 
 
-def calibration(
-    rng: np.random.Generator, K: float, currents: np.ndarray, force_sd: float, current_sd: float
-) -> dict[str, np.ndarray]:
-    """Simulate a calibration at ``currents`` (n,) A, with reading errors in both columns, N and A."""
-    n = len(currents)
-    return {
-        "force [N]": K * currents + force_sd * rng.standard_normal(n),
-        "current [A]": currents + current_sd * rng.standard_normal(n),
-    }
-
-
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     errors = (
         f'force_sd = {{ value = {FORCE_SD:g}, unit = "N" }}',
         f'current_sd = {{ value = {CURRENT_SD:g}, unit = "A" }}',
     )
-    columns = calibration(rng, values["K"], CURRENTS, FORCE_SD, CURRENT_SD)
+    columns = {
+        "force [N]": values["K"] * CURRENTS + FORCE_SD * rng.standard_normal(len(CURRENTS)),
+        "current [A]": CURRENTS + CURRENT_SD * rng.standard_normal(len(CURRENTS)),
+    }
     return Twin((TwinTable("motor_current.csv", columns, errors),))
 
 

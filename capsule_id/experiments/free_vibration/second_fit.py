@@ -13,7 +13,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import LEVEL, Start, further_columns, ljung_box, refit
-from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, equilibrium, viscous_fit
+from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, viscous_fit
 from capsule_id.experiments.free_vibration.hidden_terms import force_responses, sensitivities
 from capsule_id.experiments.free_vibration.models import (
     STEPS,
@@ -114,16 +114,6 @@ def nested_starts(e: DecayRecord) -> list[dict[str, float]]:
         }
         for values in e.about.screened.nested
     ]
-
-
-def starts_of_motion(e: DecayRecord, rough: Decrement) -> dict[str, Start]:
-    """Starts of x_rel and its rate at the first sample."""
-    size = abs(float(rough.peaks[0]))
-    rate = np.polyfit(e.time[:5], e.values[:5], 1)[0]
-    return {
-        f"x_start[{e.label}]": Start(float(e.values[0] - equilibrium(e.values)), 0.02 * size),
-        f"y_start[{e.label}]": Start(float(rate), 0.05 * rough.Omega_o * size),
-    }
 
 
 # fits: Maximum-likelihood fits of single decays, with the noise level in closed form, for the ranking of models.
