@@ -157,8 +157,8 @@ DRIVE_RULES = (
 
 
 #: Harmonics of the drive that are compared, and the smallest share of the acceleration's standard deviation there.
-HARMONICS, STRONG = (1, 2, 3, 4, 5), 0.15
-#: Fewest samples in a period of the drive.
+HARMONICS, STRONG = range(1, 6), 0.15
+#: Fewest samples in a period of the drive, or of one of its harmonics.
 FEWEST_SAMPLES = 4.0
 #: Admissible ratio of the recorded acceleration to that of the recorded position X1 = x_rel + x_capsule; without
 #: x_capsule its motion is unknown, so the limits are wide.

@@ -24,7 +24,7 @@ from capsule_id.experiments.base import (
 )
 from capsule_id.experiments.capsule_experiment import lag_of
 from capsule_id.experiments.context import Fitted, RunRecord
-from capsule_id.experiments.forced_run.declaration import SETTLING_PERIODS
+from capsule_id.experiments.forced_run.declaration import FEWEST_SAMPLES, SETTLING_PERIODS
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
@@ -195,8 +195,8 @@ def check_predictable(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
 # period of a periodic motion. Coloured noise can hide it from a test of whiteness: it is slow beside the samples.
 
 
-#: Largest number of harmonics of the excitation; fewest samples of a period for each of them.
-HARMONICS, SAMPLES_PER_HARMONIC = 10, 4
+#: Largest number of harmonics of the excitation.
+HARMONICS = 10
 #: Fewest whole periods of a record: in fewer ones a slow error of the noise looks like a repeated one.
 FEWEST_PERIODS = 4
 
@@ -223,7 +223,7 @@ def repetition(run: CapsuleRun, residuals: Float[np.ndarray, " n"]) -> tuple[flo
     """F statistic of the harmonics of the excitation in ``residuals``, and its p-value; None for a short record."""
     cycles = run.cycles
     periods = float(cycles[-1] - cycles[0])
-    number = min(HARMONICS, int(len(cycles) / periods / SAMPLES_PER_HARMONIC))
+    number = min(HARMONICS, int(len(cycles) / periods / FEWEST_SAMPLES))
     if periods < FEWEST_PERIODS or number < 1:
         return None
     angle = 2.0 * np.pi * np.outer(cycles, np.arange(1, number + 1))

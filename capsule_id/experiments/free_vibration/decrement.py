@@ -26,7 +26,7 @@ PEAK_NOISE_RATIO = 4.0
 #: Smallest peak as a fraction of the record's range, which excludes a noiseless tail. Smoothing rounds the jumps of an
 #: acceleration where dry friction turns, so that small peaks remain after the rod sticks.
 PEAK_RANGE_RATIO, PEAK_RANGE_RATIO_OF_JUMPS = 0.005, 0.05
-#: The end of a record still oscillates where its range exceeds this fraction of the whole record's range.
+#: A record still swings where its range, or its distance from rest, exceeds this fraction of the whole record's range.
 SWINGING_RATIO = 0.05
 #: Grid of the search for a viscous decay: frequencies from this many rad over the record on and their number, damping
 #: ratios of all of them and of those near the peak of the spectrum, and number of its best points that are refined.
@@ -36,8 +36,6 @@ LIGHT_RATIOS, STRONG_RATIOS = (0.001, 0.01, 0.03, 0.1), (0.2, 0.4, 0.7, 1.0, 1.5
 SMALLEST_RATIO, LARGEST_SEARCHED, LARGEST_RATIO = 1e-6, 30.0, 0.9
 #: Unknowns of a viscous decay: k1, c, two initial conditions, offset.
 UNKNOWNS = 5
-#: Smallest distance from rest of a swing, relative to the record's range.
-SMALLEST_SWING = 0.05
 #: Samples that are searched: at least, at most on the grid, and at most in the refinement.
 FEWEST_SEARCHED, MOST_SEARCHED, MOST_REFINED = 16, 1000, 20_000
 #: Spectra with fewer periods are checked by a fit; its damping ratio beyond which a spectrum may have no peak.
@@ -305,9 +303,9 @@ def likelihood_gain(one: ViscousFit, other: ViscousFit) -> float:
 def swings_enough(values: np.ndarray) -> bool:
     """Whether a record passes its rest position twice, or once where it then stays there."""
     size = (values - equilibrium(values)) / np.ptp(values)
-    smallest = max(SMALLEST_SWING, PEAK_NOISE_RATIO * noise_level(values) / float(np.ptp(values)))
+    smallest = max(SWINGING_RATIO, PEAK_NOISE_RATIO * noise_level(values) / float(np.ptp(values)))
     swings = int(np.count_nonzero(np.diff(np.sign(size[np.abs(size) > smallest]))))
-    stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SMALLEST_SWING
+    stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SWINGING_RATIO
     # Where friction stops the rod, its two strokes show their duration and what each of them loses.
     return swings >= (1 if stuck else 2)
 

@@ -13,13 +13,20 @@ from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, further_co
 from capsule_id.experiments.context import Check, Fitted
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (
+    FEWEST_HALF_SWINGS,
     check_hidden_terms,
     sensitivities,
     zero_jumps,
 )
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
-from capsule_id.experiments.free_vibration.second_fit import Screening, decay_starts, nested_starts, second_models
+from capsule_id.experiments.free_vibration.second_fit import (
+    SHORTEST,
+    Screening,
+    decay_starts,
+    nested_starts,
+    second_models,
+)
 from capsule_id.parameters import parameter
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import sampling
@@ -29,8 +36,6 @@ from capsule_id.views import Facts, Finding, Level, ResultTable
 
 #: Joint sds apart from which halves of a decay disagree or a force is seen, and from which that fails.
 DISAGREE, FAIL = 3.0, 4.0
-#: Fewest readings and half cycles of a half; fewest half cycles that a later start leaves.
-FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
 INTERVALS, READINGS_PER_INTERVAL = 12, 5
 #: Largest part of a drift that is as fast as the motion, relative to the motion.
@@ -211,7 +216,7 @@ def later_start(e: DecayRecord) -> Facts:
     size = np.abs(e.values - equilibrium(e.values))
     begin = int(np.flatnonzero(size > 0.5 * np.max(size))[-1]) + 1
     left = e.time[begin:][: length_of_motion(e.values[begin:])] if begin < len(e.time) else e.time[:0]
-    if len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_CYCLES:
+    if len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_SWINGS // 2:
         return {"start": None}
     digits = max(0, int(np.ceil(-np.log10(median_step(e.time)))))
     return {"start": float(np.round(decay_window(e.table)[0][0] + e.time[begin], digits))}
@@ -266,10 +271,10 @@ def _halves(e: DecayRecord) -> list[DecayRecord]:
     decrement = e.decrement()
     # The acceleration jumps where the rod turns, so difference quotients give no standard errors.
     jumps = e.order == 2 and "dry" in e.model.damping
-    if decrement is None or len(decrement.times) < 2 * FEWEST_HALF_CYCLES or jumps:
+    if decrement is None or len(decrement.times) < FEWEST_HALF_SWINGS or jumps:
         return []
     time = e.whole[0][e.whole[0] <= decrement.times[-1]]
-    if len(time) < 2 * FEWEST_READINGS * e.model.thin:
+    if len(time) < 2 * SHORTEST * e.model.thin:
         return []
     begin = float(decay_window(e.table)[0][0])
     middle, end = begin + float(time[len(time) // 2]), begin + float(time[-1])

@@ -14,7 +14,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import LEVEL, Start, further_columns, ljung_box, refit
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, viscous_fit
-from capsule_id.experiments.free_vibration.hidden_terms import force_responses, sensitivities
+from capsule_id.experiments.free_vibration.hidden_terms import SENSITIVITY_STEP, force_responses, sensitivities
 from capsule_id.experiments.free_vibration.models import (
     STEPS,
     HalfCycles,
@@ -26,7 +26,9 @@ from capsule_id.experiments.free_vibration.models import (
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FEWEST_PER_PERIOD,
+    LONGEST_WHOLE,
     MOST_PERIODS,
+    READINGS_PER_PERIOD,
     DecayModel,
     block_mean,
     block_means,
@@ -119,8 +121,8 @@ def nested_starts(e: DecayRecord) -> list[dict[str, float]]:
 # fits: Maximum-likelihood fits of single decays, with the noise level in closed form, for the ranking of models.
 
 
-#: Largest number of evaluations in a fit, and relative step of its difference quotients.
-EVALUATIONS, STEP = 40, 1e-5
+#: Largest number of evaluations in a fit.
+EVALUATIONS = 40
 #: Distance of starts from the bounds, and of the start of a term that a nested model lacks.
 INSIDE, ABSENT_TERM = 1e-3, 1e-9
 #: Replaces the effect of an unknown that the record does not depend on.
@@ -305,12 +307,12 @@ class Screening:
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
             stop_if_interrupted()
-            sign = np.where(z > high - 2.0 * STEP, -1.0, 1.0)
+            sign = np.where(z > high - 2.0 * SENSITIVITY_STEP, -1.0, 1.0)
             whole = np.tile(start, (len(NAMES) + 1, 1))
-            whole[: len(free) + 1, free] = np.concatenate([z[None], z + STEP * np.diag(sign)])
+            whole[: len(free) + 1, free] = np.concatenate([z[None], z + SENSITIVITY_STEP * np.diag(sign)])
             points = whitened(whole)[: len(free) + 1]
             points = np.where(np.isfinite(points), points, UNFIT)
-            jacobians[z.tobytes()] = (points[1:] - points[:1]).T / (STEP * sign)
+            jacobians[z.tobytes()] = (points[1:] - points[:1]).T / (SENSITIVITY_STEP * sign)
             return points[0]
 
         low, high = np.array([BOUNDS[NAMES[i]] for i in free]).T
@@ -390,15 +392,10 @@ class Screening:
 # then fitted to the record by maximum likelihood and ranked by BIC.
 
 
-#: Records are thinned to this many readings per period before their models are ranked.
-READINGS_PER_PERIOD = 16
-#: Fewest readings of a thinned record.
-FEWEST_READINGS = 80
-#: Largest number of samples of a record that is no free decay.
-LONGEST_UNCUT = 1000
 #: Of forces whose BIC differs by less, the fewest are chosen: with seven alternatives, noise alone often gains this much.
 BIC_MARGIN = 4.0
-#: Shorter records, in samples, keep their model.
+#: Shorter records, in samples, keep their model, and shorter halves of a record are not fitted. A thinned record has twice
+#: as many readings.
 SHORTEST = 40
 #: Residuals with a larger p-value of the Ljung–Box test count as white here; the check after the fit is more lenient.
 WHITENESS = 0.01
@@ -457,7 +454,7 @@ def thinning(record: DecayRecord, per_period: float) -> int:
     """Return the block size that leaves about ``per_period`` readings, and not too few; no less than that of the record."""
     time = record.whole[0]
     step = 2.0 * np.pi / (record.rough.Omega_o * per_period * median_step(time))
-    return max(record.model.thin, min(int(step), len(time) // FEWEST_READINGS))
+    return max(record.model.thin, min(int(step), len(time) // (2 * SHORTEST)))
 
 
 @dataclass(frozen=True)
@@ -514,7 +511,7 @@ def demanded_model(records: Sequence[DecayRecord]) -> Ranking:
     noise. The fits of fewer forces become starts of the quoted fit.
     """
     forces, others = open_models(records[0])
-    coarse = min(thinning(record, READINGS_PER_PERIOD) for record in records)
+    coarse = min(thinning(record, 0.5 * READINGS_PER_PERIOD) for record in records)
     thinned = [Screening(record, coarse) for record in records]
     by_forces = rank(thinned, [replace(model, noise=others[-1].noise) for model in forces])
     best = simplest(by_forces)
@@ -631,7 +628,7 @@ def second_models(
     for i, record in enumerate(records):
         settings = record.table.settings
         if record.label in no_decay and None in settings.choices:
-            thin = settings.thin or max(1, len(record.whole[0]) // LONGEST_UNCUT)
+            thin = settings.thin or max(1, 2 * len(record.whole[0]) // LONGEST_WHOLE)
             kept[i] = record.with_model(replace(record.model, thin=thin))
             findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "thin": thin}, record.label))
     judged = (i for i, record in enumerate(records) if record.label not in no_decay)
