@@ -156,8 +156,7 @@ class Comparison:
     ----------
     kind : "friction", "motor_current", "support_spring", "free_vibration"
     residual_x, residuals : (n,) at the point fit, residuals in units of the noise sd (None: no residual panel)
-    autocorrelation : (lags,) of the residuals, lag 1 first (time series only), with ``autocorrelation_bound`` the
-        half-width of the 95 % band of a white record
+    autocorrelation : (lags,) of the residuals, lag 1 first (time series only)
     predictive_p : posterior predictive p-value of the chi-square discrepancy (None without a sample)
     """
 
@@ -171,5 +170,4 @@ class Comparison:
     residual_x: np.ndarray | None = None
     residuals: np.ndarray | None = None
     autocorrelation: np.ndarray | None = None
-    autocorrelation_bound: float | None = None
     predictive_p: float | None = None

@@ -108,7 +108,7 @@ def _decay(number: int, rng: np.random.Generator, n: int = 1000) -> Comparison:
         "relative displacement [mm]",
         points=(Points("measured", t, clean + 0.01 * (1 + number) * residuals),),
         curves=(Curve("this fit", t, clean, clean - 0.02, clean + 0.02),),
-        residual_x=t, residuals=residuals, autocorrelation=autocorrelation, autocorrelation_bound=1.96 / np.sqrt(n),
+        residual_x=t, residuals=residuals, autocorrelation=autocorrelation,
         predictive_p=0.55,
     )  # fmt: skip
 

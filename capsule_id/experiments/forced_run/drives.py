@@ -391,7 +391,6 @@ class OtherRun(CapsuleRun):
                     self.time,
                     residuals,
                     autocorrelation(residuals),
-                    1.96 / float(np.sqrt(len(self.time))),
                 )
             )
         return (*panels, *(_portrait(self, theta) if "x_rel" in self.names else []))

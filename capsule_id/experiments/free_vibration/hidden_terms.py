@@ -222,12 +222,11 @@ def check_hidden_terms(records: Sequence[Decay], fit: Fitted) -> list[Finding]:
         theta = members[0].local(fit.values)
         # No record of a decay that does not swing excludes these forces, so the stated model is believed.
         swings = theta["c"] < 2.0 * STRONGEST * np.sqrt(theta["k1"] * theta["m1"])
+        level: Level = "fail" if swings else "warn"
         facts = {"labels": [e.label for e in members], "offers_cubic": offers_cubic, "swings": swings}
         compared += facts["labels"]
         findings += [
-            Finding("decays.hidden", "fail", {**facts, **changed}, parameters=(name,))
-            if swings
-            else Finding("decays.hidden", "warn", {**facts, **changed})
+            Finding("decays.hidden", level, {**facts, **changed}, parameters=(name,) if swings else ())
             for name in CHANGES
             if (changed := _change(name, fit.values[name], {symbol: terms[symbol] for symbol in offered}))
         ]

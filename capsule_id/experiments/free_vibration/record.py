@@ -309,7 +309,6 @@ class Decay(SurfaceExperiment):
             time,
             residuals,
             autocorrelation(residuals) if self.time_series else None,
-            1.96 / float(np.sqrt(self.n)) if self.time_series else None,
         )
 
 

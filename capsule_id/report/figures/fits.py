@@ -100,11 +100,11 @@ def autocorrelation(item: Comparison, ax: Axes) -> None:
     ValueError
         If the comparison has no autocorrelation.
     """
-    if item.autocorrelation is None:
+    if item.autocorrelation is None or item.residuals is None:
         raise ValueError(f"{item.label} has no autocorrelation")
-    bound = item.autocorrelation_bound or 0.0
+    bound = QUANTILE_975 / float(np.sqrt(item.residuals.size))
     limit = 1.25 * max(_largest(item.autocorrelation), 2.0 * bound, 0.05)
-    _about_zero(ax, bound, limit, "95 % of white records" if bound else None)
+    _about_zero(ax, bound, limit, "95 % of white records")
     ax.vlines(np.arange(1, item.autocorrelation.size + 1), 0.0, item.autocorrelation, color=BLACK, lw=1.3)
     set_text(ax, "lag [samples]", "autocorrelation [1]")
     set_legend(ax, "above")  # bars of a coloured record reach everywhere

@@ -82,7 +82,7 @@ def subfigure_at(ax: Axes) -> SubFigure:
     return figure.add_subfigure(place or GridSpec(1, 1, figure=figure)[0])
 
 
-def set_text(ax: Axes, x_label: str, y_label: str, title: str = "", size: float = TEXT) -> None:
+def set_text(ax: Axes, x_label: str, y_label: str, title: str = "", *, size: float = TEXT) -> None:
     """Labels and title as plain text: a ``$`` in somebody's file name is no mathematics."""
     ax.set_xlabel(x_label, fontsize=size, parse_math=False)
     ax.set_ylabel(y_label, fontsize=size, parse_math=False)
