@@ -190,7 +190,6 @@ class PointTest(GroundExperiment):
                 ),
             ),
             (Curve("this fit", along * column.to_display, curve(theta), lower, upper),),
-            x * column.to_display,
             self.residuals(theta, np)[: self.n],
         )
 

@@ -388,7 +388,6 @@ class OtherRun(CapsuleRun):
                     axis_label(column),
                     (Points(self.label, self.time, channel.values * unit),),
                     (Curve("this fit", self.time, fitted * unit, *limits),),
-                    self.time,
                     residuals,
                     autocorrelation(residuals),
                 )

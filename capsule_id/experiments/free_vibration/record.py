@@ -306,7 +306,6 @@ class Decay(SurfaceExperiment):
             axis_label(self.column),
             (Points(self.label, time, self.values * unit),),
             (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
-            time,
             residuals,
             autocorrelation(residuals) if self.time_series else None,
         )

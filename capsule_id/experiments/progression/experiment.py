@@ -440,7 +440,6 @@ class Progression(CapsuleForward):
                     "mean velocity [mm/s]",
                     (trials,) if len(rows) else (),
                     (Curve(label, 1e3 * settings[own, 0], centre[own], lower, upper),),
-                    None if residuals is None else period[rows],
                     None if residuals is None else residuals[rows],
                 )
             )

@@ -84,11 +84,11 @@ def residuals(item: Comparison, ax: Axes) -> None:
     ValueError
         If the comparison has no residuals.
     """
-    if item.residuals is None or item.residual_x is None:
+    if item.residuals is None:
         raise ValueError(f"{item.label} has no residuals")
     many = item.residuals.size > _MANY
     _about_zero(ax, QUANTILE_975, 1.1 * max(3.0, _largest(item.residuals)))
-    ax.plot(item.residual_x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
+    ax.plot(item.points[0].x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
     set_text(ax, item.x_label, "residual / sd [1]")
 
 
