@@ -219,12 +219,8 @@ class Experiment(eqx.Module):
         return ()  # values, SI, by name, of fits of simpler models: further starts
 
     @abstractmethod
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        """Compare readings and prediction at the point fit ``theta``, with a band from ``draws`` (may be [])."""
-
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
-        """Return all panels of the experiment."""
-        return (self.comparison(theta, draws),)
+        """Panels of readings and prediction at the point fit ``theta``, with bands from ``draws`` (may be [])."""
 
     def log_likelihood(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings, linear nuisances integrated out; scalar."""

@@ -147,7 +147,7 @@ class Weighing(Experiment):
     def starts(self) -> dict[str, Start]:
         return {"load": Start(float(np.mean(self.values)), 0.1)}
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         raise NotImplementedError
 
 

@@ -54,7 +54,7 @@ class Nothing(Experiment):
     def starts(self) -> dict[str, Start]:
         return {}
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         raise NotImplementedError
 
 

@@ -359,9 +359,6 @@ class OtherRun(CapsuleRun):
     checks = (check_predictable, check_repeated)
     tables = (predicted_motion,)
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        return self.comparisons(theta, draws)[0]
-
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         """Return a panel per channel (prediction, 95 % band, residuals, autocorrelation), then the phase portrait.
 

@@ -290,7 +290,7 @@ class Decay(SurfaceExperiment):
         """Keys of the model that the entry states; a second fit leaves them as they are."""
         return tuple(word for word in CHOICES if getattr(self.table.settings, word) is not None)
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         def curve(values: ValuesBySymbol) -> np.ndarray:
             raw, design = self.unwhitened(values, np)
             return (self.observed - raw + design @ self.nuisance_mean(values))[: len(self.time)]
@@ -298,16 +298,18 @@ class Decay(SurfaceExperiment):
         unit, time = self.column.to_display, self.time + float(decay_window(self.table)[0][0])
         lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)
         residuals = np.asarray(self.residuals(theta, np))[: len(time)]
-        return Comparison(
-            self.kind,
-            self.label,
-            f"{self.label}: {self.title}",
-            "time [s]",
-            axis_label(self.column),
-            (Points(self.label, time, self.values * unit),),
-            (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
-            residuals,
-            autocorrelation(residuals) if self.time_series else None,
+        return (
+            Comparison(
+                self.kind,
+                self.label,
+                f"{self.label}: {self.title}",
+                "time [s]",
+                axis_label(self.column),
+                (Points(self.label, time, self.values * unit),),
+                (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
+                residuals,
+                autocorrelation(residuals) if self.time_series else None,
+            ),
         )
 
 

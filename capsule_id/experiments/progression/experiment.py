@@ -466,9 +466,6 @@ class Progression(CapsuleForward):
         """Those of ``motions_of_draws`` that the experiment without one setting has."""
         return motions[:, np.asarray(self.sessions.setting_of_run) != setting]
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        return self.comparisons(theta, draws)[0]
-
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         """One panel per duty and amplitude: trials, the point fit, and the band of a new trial in a new session."""
         settings = self.settings

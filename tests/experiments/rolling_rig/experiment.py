@@ -70,12 +70,12 @@ class RollingResistance(Experiment):
             "rolling_scatter": Start(float(np.std(self.force)), 0.3),
         }
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         del draws
         speed, force = (self.table.columns[name] for name in ("speed", "force"))
         level = theta["c_rr"] * (theta["m1"] + theta["m2"]) * theta["g"] * force.to_display
         x = self.speed * speed.to_display
-        return Comparison(
+        panel = Comparison(
             self.kind,
             self.label,
             f"{self.label}: rolling resistance",
@@ -84,3 +84,4 @@ class RollingResistance(Experiment):
             (Points(self.label, x, self.force * force.to_display),),
             (Curve("this fit", x, np.full(self.n, level)),),
         )
+        return (panel,)
