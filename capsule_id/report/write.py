@@ -168,8 +168,9 @@ def load_fields(directory: Path, registry: Registry) -> dict[str, Any]:
         If ``directory`` holds no result, one that another version wrote, or a file that has changed since.
     """
     roots = {"capsule_id", *(kind.settings.__module__.partition(".")[0] for kind in registry.kinds)}
-    with _reading(directory / SAVED), np.load(directory / SAVED, allow_pickle=False) as file:
-        arrays = dict(file)
+    with _reading(directory / SAVED):
+        # From bytes: NumPy leaves a damaged file open.
+        arrays = dict(np.load(io.BytesIO((directory / SAVED).read_bytes()), allow_pickle=False))
         own, of_sample = arrays.pop(_DIGESTS).tolist()
         _check(own, _digest(arrays))
         kept = _decode(json.loads(arrays[_TREE].tobytes().decode("utf-8")), arrays, roots)
