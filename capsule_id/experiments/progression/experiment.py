@@ -37,7 +37,7 @@ from capsule_id.experiments.progression.density import (
     parameters_of,
 )
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.physics.batches import pool
+from capsule_id.physics.batches import in_batches
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import equilibrium, scaled
@@ -89,10 +89,7 @@ def batched(function: Callable[..., Any], draws: Sequence[ValuesBySymbol], s: np
     """
     symbols = tuple(name for name in draws[0] if np.ndim(draws[0][name]) == 0)
     rows = np.concatenate([np.array([[draw[name] for name in symbols] for draw in draws]), s], axis=1)
-    padded = np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % DRAWS_OF_A_BATCH, axis=0)])
-    parts = np.split(padded, len(padded) // DRAWS_OF_A_BATCH)
-    found = pool().map(lambda part: np.asarray(_of_rows(function, symbols, part)), parts)
-    return np.concatenate(list(found))[: len(rows)]
+    return in_batches(lambda part: _of_rows(function, symbols, part), rows, DRAWS_OF_A_BATCH)
 
 
 @eqx.filter_jit
