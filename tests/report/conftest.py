@@ -161,7 +161,6 @@ COLOURED = {
     "model": "decay",
     "present": (),
     "second": False,
-    "lines": "",
 }
 CHAINS = {
     "draws": 1000, "length": 12.0, "slowest": "v_s", "rhat": 1.2, "worst": "mu", "length_wanted": 20.0,

@@ -167,7 +167,6 @@ RATIO_OF_X1, RATIO_OF_X_REL = (0.5, 2.0), (0.1, 10.0)
 
 def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Report faults of the record, a stated frequency that differs from that of the current, and wrong columns."""
-    del rig
     used = slice(0, len(table.rows))
     yield from lint_times(table, used)
     time, period = table["time"], 2.0 * np.pi / stated_Omega(table)

@@ -515,9 +515,9 @@ def better_start(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float] | N
     best, where = np.full(len(speeds), np.inf), rod
     for _ in range(GAUSS_NEWTON_STEPS):
         miss = np.stack([_misses(moving, theta, *one, speeds) for one in rod + offsets[..., None]])
-        squares = np.sum(miss[0] ** 2, axis=1)
-        better = squares < best
-        best, where = np.where(better, squares, best), np.where(better, rod, where)
+        cost = 0.5 * np.sum(miss[0] ** 2, axis=1)
+        better = cost < best
+        best, where = np.where(better, cost, best), np.where(better, rod, where)
         slope = (miss[1:] - miss[0]) / DIFFERENCE_STEPS[:, None, None]
         normal = np.einsum("iln,jln->lij", slope, slope)
         pull = np.einsum("iln,ln->li", slope, miss[0])
@@ -526,11 +526,11 @@ def better_start(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float] | N
         step = -np.einsum("lij,lj->il", np.linalg.pinv(normal), pull)
         rod = rod + np.clip(step, -LARGEST_STEPS, LARGEST_STEPS)
     found = int(np.argmin(best))
-    if 0.5 * (best[ZERO_SPEED] - best[found]) < LOG_LIKELIHOOD_RATIO:
+    if best[ZERO_SPEED] - best[found] < LOG_LIKELIHOOD_RATIO:
         found = ZERO_SPEED
     # The last speed is that of ``theta``.
     same_kind = np.sign(speeds[found]) == (np.sign(own) if run.moves else 0.0)
-    if same_kind or (0.5 * (best[-1] - best[found]) < LOG_LIKELIHOOD_RATIO and speeds[found] != 0.0):
+    if same_kind or (best[-1] - best[found] < LOG_LIKELIHOOD_RATIO and speeds[found] != 0.0):
         return None
     x, Y1 = where[:, found].tolist()
     speed = float(speeds[found])

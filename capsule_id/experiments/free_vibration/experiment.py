@@ -208,7 +208,7 @@ def size_of_residuals(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, flo
     ratio = float(np.sqrt(np.mean(residuals[large] ** 2) / np.mean(residuals[~large] ** 2)))
     trend = stats.spearmanr(amplitude, residuals, alternative="greater")
     p = float(trend.pvalue)  # pyright: ignore[reportAttributeAccessIssue]  (SciPy types the result as a tuple)
-    return {"ratio": ratio, "p": p, "stated": e.stated_words, **later_start(e)}, p if ratio > LARGER else 1.0
+    return {"ratio": ratio, "p": p, **later_start(e)}, p if ratio > LARGER else 1.0
 
 
 def later_start(e: DecayRecord) -> Facts:
@@ -365,6 +365,12 @@ class FreeVibration(DecayRecord):
         return nested_starts(self)
 
     def noise_facts(self) -> Facts:
-        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.lines}
-        facts |= {"tone": other_tone(self.time, self.values)}
-        return {"model": "decay", "stated": self.stated_words, **facts, **later_start(self)}
+        present, tone = self.model.additions, other_tone(self.time, self.values)
+        facts = {
+            "model": "decay",
+            "present": present,
+            "second": self.replaced,
+            "tone": tone,
+            "stated": self.stated_words,
+        }
+        return facts | later_start(self)

@@ -144,7 +144,6 @@ def _check_periods(entry: Entry[ProgressionSettings]) -> None:
 
 def _lint_settings(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where a table has few settings, or more sessions with several settings than there are parameters for."""
-    del rig
     drives = np.delete(settings_of(table.columns, table.settings)[0], 1, axis=1)
     setting = np.unique(drives, axis=0, return_inverse=True)[1]
     settings = 1 + int(np.max(setting))
