@@ -129,7 +129,7 @@ KIND = Kind(
     parameters=(PUSH_SCATTER,),
     read_by=INSTRUMENT_ERRORS,
     make=made_by(
-        "capsule_id.experiments.dynamic_friction:DynamicFriction",
+        f"{__name__}:DynamicFriction",
         capsule="capsule_id.experiments.capsule_experiment:CapsulePushes",
     ),
     template=TEMPLATE,

@@ -373,4 +373,4 @@ class FreeVibration(DecayRecord):
             "tone": tone,
             "stated": self.stated_words,
         }
-        return facts | later_start(self)
+        return {**facts, **later_start(self)}
