@@ -421,7 +421,6 @@ class RecordedRun(OtherRun):
 
     current: np.ndarray
 
-    has_phase = False
     inputs = ("current",)
 
     def read_drive(self, table: Table, rig: Rig) -> None:

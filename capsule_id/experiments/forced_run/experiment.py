@@ -155,8 +155,7 @@ class CapsuleRun(CapsuleForward):
 
     #: Whether the record prescribes the motion of the rod.
     prescribed: ClassVar[bool] = False
-    #: Whether the phase of the drive is a parameter, and channels that are inputs, not readings.
-    has_phase: ClassVar[bool] = True
+    #: Channels that are inputs, not readings.
     inputs: ClassVar[tuple[str, ...]] = ()
     time_series = True
 
@@ -230,7 +229,7 @@ class CapsuleRun(CapsuleForward):
             rows += stated_parameters("P_d", settings.P_d, whole)
         rows += [parameter("K")] if "current" in self.inputs else []
         rows += [*stated_parameters("P_on", settings.P_on, kind="normal"), *lag_of(self.table, self.rig)[0]]
-        if self.has_phase and not self.prescribed:
+        if not (self.inputs or self.prescribed):
             rows.append(parameter("phase", whole, Prior("normal", 0.0, np.pi)))  # wide but proper
         length = NUISANCE_WIDTH * self.rough.length
         position, rate = Prior("normal", 0.0, length), Prior("normal", 0.0, self.Omega * length)

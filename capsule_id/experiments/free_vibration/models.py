@@ -52,14 +52,12 @@ class HalfCycles(NamedTuple):
 
     Attributes
     ----------
-    times, amplitudes : (half_cycles,) s and m, of the turning points; the rod sticks at an amplitude of at most ``rest``
-    rest : () m, where the spring balances dry friction
+    times, amplitudes : (half_cycles,) s and m, of the turning points
     node_times, positions, velocities, accelerations : (half_cycles, steps + 1), both ends of the half cycle included
     """
 
     times: Any
     amplitudes: Any
-    rest: Any
     node_times: Any
     positions: Any
     velocities: Any
@@ -137,7 +135,7 @@ def half_cycles(
     x = jnp.where(r > 0.0, rest + r * np.cos(nodes), amplitudes[:, None])
     y = -stretch[:, None] * omega * r * np.sin(nodes)
     pull = k1 * x + k_cubic * x**3 - F_dry + c * y - c_q * y**2
-    return HalfCycles(times, amplitudes, rest, t, x, y, jnp.where(r > 0.0, -pull / m1, 0.0))
+    return HalfCycles(times, amplitudes, t, x, y, jnp.where(r > 0.0, -pull / m1, 0.0))
 
 
 @partial(jax.jit, static_argnames="number")
@@ -164,7 +162,7 @@ def interpolate(path: HalfCycles, time: Any) -> Motion:
     steps = path.node_times.shape[1] - 1
     node = jnp.clip(jnp.searchsorted(path.node_times[:, :-1].ravel(), time, side="right") - 1, 0, number * steps - 1)
     half, left = node // steps, node % steps
-    t, t_next, x, x_next, y, y_next, a, a_next = (values[half, at] for values in path[3:] for at in (left, left + 1))
+    t, t_next, x, x_next, y, y_next, a, a_next = (values[half, at] for values in path[2:] for at in (left, left + 1))
     h = t_next - t
     s = (time - t) / h
     y, y_next, a, a_next = h * y, h * y_next, h**2 * a, h**2 * a_next
