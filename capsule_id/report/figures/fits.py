@@ -4,7 +4,6 @@ A panel is ``(data, ax)`` and draws into ``ax``; labels are plain text.
 """
 
 from collections.abc import Sequence
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -34,8 +33,6 @@ from capsule_id.report.figures.style import (
     SMALL,
     TEXT,
     VERMILION,
-    figure_of,
-    new_axes,
     new_figure,
     set_legend,
     set_margins,
@@ -122,23 +119,14 @@ def _largest(values: np.ndarray) -> float:
 
 
 def comparison_figure(item: Comparison) -> Figure:
-    """The panel of a comparison with the residual and autocorrelation panels that it has."""
-    if item.residuals is None:
-        comparison(item, ax := new_axes(height=5.6))
-        return figure_of(ax)
-    if item.autocorrelation is None:
-        figure = new_figure(6.4, 5.6)
-        top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (2.4, 1.0), "hspace": 0.12})
-    else:
-        figure = new_figure(9.0, 5.6)
-        grid = figure.add_gridspec(2, 2, height_ratios=(1.7, 1.0), hspace=0.38, wspace=0.25)
-        top, bottom = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
-        autocorrelation(item, figure.add_subplot(grid[1, 1]))
+    """The panel of a comparison over the residual and autocorrelation panels that it has."""
+    below = [residuals] * (item.residuals is not None) + [autocorrelation] * (item.autocorrelation is not None)
+    figure = new_figure(9.0 if item.autocorrelation is not None else 6.4, 5.6)
+    grid = figure.add_gridspec(2, max(len(below), 1), height_ratios=(1.7, 1.0), hspace=0.38, wspace=0.25)
+    top = figure.add_subplot(grid[0, :] if below else grid[:, :])
     comparison(item, top)
-    residuals(item, bottom)
-    if item.autocorrelation is None:
-        top.label_outer()
-        figure.align_ylabels([top, bottom])
+    for column, panel in enumerate(below):
+        panel(item, figure.add_subplot(grid[1, column], sharex=top if panel is residuals else None))
     return figure
 
 
@@ -147,11 +135,8 @@ def side_by_side(items: Sequence[Comparison]) -> Figure:
     columns = min(len(items), 2)
     rows = -(-len(items) // columns)
     figure = new_figure(6.4 * columns, 4.4 * rows, wspace=0.2, hspace=0.3)
-    for ax, item in zip_longest(figure.subplots(rows, columns, squeeze=False).flat, items):
-        if item is None:
-            ax.set_axis_off()
-        else:
-            comparison(item, ax)
+    for number, item in enumerate(items, start=1):
+        comparison(item, figure.add_subplot(rows, columns, number))
     return figure
 
 
