@@ -201,7 +201,7 @@ def test_the_estimate_of_a_long_record_is_that_of_its_means(monkeypatch: pytest.
     assert len(record.condensed[0]) == 1000
     # The second fit takes its readings from every sample, as the record does.
     assert len(record.whole[0]) == 4000
-    assert len(Screening(record).blocks.values) == record.n
+    assert len(Screening(record).values) == record.n
     assert is_even(record.condensed[0])
     assert means.k1 != whole.k1
     assert means.k1 == pytest.approx(whole.k1, rel=2e-3)

@@ -212,7 +212,7 @@ class Screening:
         self.turning_time, peak = record.first_turning_point()
         self.side, self.period = float(np.sign(peak)), 2.0 * np.pi / self.omega
         self.blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
-        self.times = ReadingTimes.of(self.blocks)
+        self.values, self.times = self.blocks.values, ReadingTimes.of(self.blocks)
         self.number = most_half_cycles(float(record.time[-1]), self.omega)
         k1 = k1 or record.rough.k1
         self.units = natural_units(k1, record.mass, abs(peak)) | {
@@ -294,15 +294,12 @@ class Screening:
         """
         start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
         jacobians: dict[bytes, np.ndarray] = {}
-        unit = float(np.std(self.blocks.values))
+        unit = float(np.std(self.values))
 
         def whitened(whole: np.ndarray) -> np.ndarray:
             """(names + 1, n) residuals at as many scaled unknowns."""
             thetas, motion = self.motions(whole)
-            return (
-                np.asarray(_whitened(self.times, self.blocks.values - motion, thetas, model.drift == "linear")[0])
-                / unit
-            )
+            return np.asarray(_whitened(self.times, self.values - motion, thetas, model.drift == "linear")[0]) / unit
 
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
@@ -348,11 +345,11 @@ class Screening:
     def drowned(self, z: np.ndarray) -> bool:
         """Whether drift and noise at scaled unknowns (names,) are larger than the motion."""
         motion = self.motions(z[None])[1][0]
-        return not np.std(self.blocks.values - motion) <= np.std(motion)
+        return not np.std(self.values - motion) <= np.std(motion)
 
     def drift(self, z: np.ndarray) -> float:
         """Range of the mean over one period of measured minus predicted readings, SI, at scaled unknowns (names,)."""
-        raw = self.blocks.values - self.motions(z[None])[1][0]
+        raw = self.values - self.motions(z[None])[1][0]
         time = self.times.time
         half = 0.5 * self.period
         first, last = np.searchsorted(time, time - half), np.searchsorted(time, time + half)
@@ -371,7 +368,7 @@ class Screening:
     ) -> Screened:
         """Estimates at the end ``found`` of a fit, at the scaled unknowns ``z`` (names,); ``unit`` of its residuals."""
         free = free_symbols(model)
-        n, unknowns = len(self.blocks.values), len(free) + 2 + int(model.drift == "linear")
+        n, unknowns = len(self.values), len(free) + 2 + int(model.drift == "linear")
         deviance = n * (np.log(2.0 * found.cost * unit**2 / n) + 1.0 + LOG_2PI)
         values = {name: float(value) for name, value in self.theta(z).items()}
         norms = np.linalg.norm(found.jac, axis=0)
