@@ -157,10 +157,6 @@ class PointTest(GroundExperiment):
         size = self.instrument(self.reading, theta)[0] if self.relative else 1.0
         return (Misfit(raw, variance, size * self.change(theta), self.design(self.n, xp)),)
 
-    def starts(self) -> dict[str, Start]:
-        """None: parameters start at the medians of their priors."""
-        return {}
-
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         """Readings against the first other column, or in order; curves hold the further columns at their means."""
         y, others = self.table.columns[self.reading], (c for c in self.table.columns.values() if c.name != self.reading)

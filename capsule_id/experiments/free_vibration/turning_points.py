@@ -365,8 +365,8 @@ class TurningPoints(Decay):
             Misfit(times, self.time_reading_sd**2, 1.0, self.time_width * one),
         )
 
-    def paper_decrement(self, smooth: bool = True) -> Decrement:
-        """Observed frequency and logarithmic decrement of the turning points; ``smooth`` has no effect."""
+    def paper_decrement(self) -> Decrement:
+        """Observed frequency and logarithmic decrement of the turning points."""
         peaks = self.values - (0.5 * (self.values[-1] + self.values[-2]) if self.both_sides else 0.0)
         return Decrement.of(self.index, self.time, peaks, self.mass, smallest=0.05)
 
