@@ -20,7 +20,7 @@ from capsule_id.experiments.free_vibration.readings import (
     natural_units,
 )
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord
-from capsule_id.parameters import parameter
+from capsule_id.parameters import QUANTILE_975, parameter
 from capsule_id.views import Facts, Finding, Level
 
 # sensitivities: Effects of the parameters on the readings of a decay, and of forces that the fitted model lacks.
@@ -170,8 +170,6 @@ def _least_squares(known: np.ndarray, columns: np.ndarray, values: np.ndarray) -
 # the records allow, and the values beside it.
 
 
-#: Probability that a further force is below its limit.
-LIMIT = 0.975
 #: Changes of c and of k1 by a force at its limit that matter: relative to the value, and in standard errors.
 CHANGES: Mapping[str, float] = {"c": 0.2, "k1": 0.05}
 CHANGE_IN_ERRORS = 3.0
@@ -198,13 +196,12 @@ class Hidden:
     errors: Mapping[str, float]
 
     def limits(self, signed: bool) -> tuple[float, float]:
-        """Smallest and largest value, SI, at the level ``LIMIT``; of one that is not ``signed`` the smallest is 0."""
+        """Ends of the 95 % interval, SI; of one that is not ``signed``, 0 and the 97.5 % quantile."""
         if signed:
-            width = self.sd * float(stats.norm.isf(1.0 - LIMIT))
-            return self.estimate - width, self.estimate + width
+            return self.estimate - QUANTILE_975 * self.sd, self.estimate + QUANTILE_975 * self.sd
         # Far below zero the posterior above zero is exponential: its limit goes to 0.
         ratio = max(self.estimate / self.sd, LOWEST)
-        beyond = (1.0 - LIMIT) * float(stats.norm.cdf(ratio))
+        beyond = float(stats.norm.sf(QUANTILE_975) * stats.norm.cdf(ratio))
         return 0.0, self.sd * (ratio + float(stats.norm.isf(beyond)))
 
 
