@@ -145,7 +145,7 @@ class Curve:
     y: np.ndarray
     lower: np.ndarray | None = None
     upper: np.ndarray | None = None
-    role: Literal["ours", "paper", "predictive", "alternative"] = "ours"
+    role: Literal["ours", "paper", "alternative"] = "ours"
 
 
 @dataclass(frozen=True)
@@ -155,9 +155,8 @@ class Comparison:
     Attributes
     ----------
     kind : "friction", "motor_current", "support_spring", "free_vibration"
-    residual_x, residuals : (n,) at the point fit, residuals in units of the noise sd (None: no residual panel)
-    autocorrelation : (lags,) of the residuals, lag 1 first (time series only), with ``autocorrelation_bound`` the
-        half-width of the 95 % band of a white record
+    residuals : (n,) of the first of ``points`` at the point fit, in units of the noise sd (None: no residual panel)
+    autocorrelation : (lags,) of the residuals, lag 1 first (time series only)
     predictive_p : posterior predictive p-value of the chi-square discrepancy (None without a sample)
     """
 
@@ -168,8 +167,6 @@ class Comparison:
     y_label: str
     points: tuple[Points, ...]
     curves: tuple[Curve, ...]
-    residual_x: np.ndarray | None = None
     residuals: np.ndarray | None = None
     autocorrelation: np.ndarray | None = None
-    autocorrelation_bound: float | None = None
     predictive_p: float | None = None

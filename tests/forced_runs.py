@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 
 from capsule_id.experiments.forced_run.drives import ForcedRun
-from capsule_id.experiments.forced_run.twin import RUNS, STEP, SyntheticRun, make_runs
-from capsule_id.experiments.forced_run.twin import SAMPLES as RECORDED
+from capsule_id.experiments.forced_run.twin import RUNS, SyntheticRun, make_runs
 from capsule_id.experiments.kind import default_registry
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.physics.simulation import simulate
@@ -16,6 +15,8 @@ from capsule_id.synthetic import Truth
 from tests.experiments import bench
 
 SAMPLES = 120
+#: Samples of the records that these runs are the beginnings of.
+RECORDED = 2000
 NOISE = {"noise_x_rel": 1.1e-5, "noise_x_capsule": 5.2e-6, "noise_acceleration_rod": 0.9, "noise_current": 4.8e-3}
 TRUTH = Truth().with_kinds([default_registry()["forced_run"]])
 
@@ -23,7 +24,7 @@ TRUTH = Truth().with_kinds([default_registry()["forced_run"]])
 @cache
 def recorded() -> tuple[SyntheticRun, ...]:
     """The twin's four runs at 1 kHz; at seed 0 the first starts with the capsule moving, the others with it stuck."""
-    return tuple(make_runs(TRUTH, 0, tuple(replace(run, samples=RECORDED, step=STEP) for run in RUNS)))
+    return tuple(make_runs(TRUTH, 0, tuple(replace(run, samples=RECORDED, step=1e-3) for run in RUNS)))
 
 
 def table(number: int = 0, samples: int = SAMPLES, without: tuple[str, ...] = (), **settings: object) -> Table:

@@ -122,9 +122,9 @@ def test_the_reference_is_the_same_everywhere() -> None:
     words = " ".join(README.split())
     assert f"*{citation.TITLE}*, {citation.PUBLISHED}." in words
     (entry,) = yaml_references((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    first, last = citation.PAGES
-    known = {"title": citation.TITLE, "journal": citation.JOURNAL, "volume": str(citation.VOLUME)}
-    assert entry == known | {"year": str(citation.YEAR), "start": str(first), "end": str(last), "type": "article"}
+    start, end = citation.PAPER["pages"].split("--")
+    known = {key: citation.PAPER[key] for key in ("title", "journal", "volume", "year")}
+    assert entry == known | {"start": start, "end": end, "type": "article"}
 
 
 def yaml_references(text: str) -> list[dict[str, str]]:

@@ -211,20 +211,16 @@ class Experiment(eqx.Module):
         pairs = zip(self.misfits(theta, xp), self.scatters, strict=True)
         return [misfit.at(theta[symbol] if symbol else 0.0, xp) for misfit, symbol in pairs]
 
-    @abstractmethod
     def starts(self) -> dict[str, Start]:
-        """Start of every parameter of this experiment, by name, estimated roughly from its own readings."""
+        """Starts by name, estimated roughly from its own readings; other parameters start at the medians of their priors."""
+        return {}
 
     def nested_starts(self) -> Sequence[Mapping[str, float]]:
         return ()  # values, SI, by name, of fits of simpler models: further starts
 
     @abstractmethod
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        """Compare readings and prediction at the point fit ``theta``, with a band from ``draws`` (may be [])."""
-
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
-        """Return all panels of the experiment."""
-        return (self.comparison(theta, draws),)
+        """Panels of readings and prediction at the point fit ``theta``, with bands from ``draws`` (may be [])."""
 
     def log_likelihood(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings, linear nuisances integrated out; scalar."""
@@ -319,19 +315,14 @@ class Experiment(eqx.Module):
         """Record for comparison with the figures of the paper; None where there is none."""
 
 
-def no_design(n: int, xp: ModuleType = jnp) -> Any:
-    """Return the design of an experiment without linear nuisances, (n, 0)."""
-    return xp.zeros((n, 0))
-
-
 def scatter_prior(size: float) -> Prior:
     """Default prior of a standard deviation that only the readings show; ``size`` is their range."""
     return Prior("lognormal", 0.01 * size, 100.0)
 
 
-def axis_label(column: Column, symbol: str = "") -> str:
-    """Return the axis label ``name, unit``."""
-    return f"{symbol or column.name} [{column.unit}]"
+def axis_label(column: Column) -> str:
+    """Return the axis label ``name [unit]``."""
+    return f"{column.name} [{column.unit}]"
 
 
 def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -380,24 +371,21 @@ def stretch(rate: float | None, theta: ValuesBySymbol) -> Any:
 
 #: Family-wise false-alarm rate of a check over its experiments, dimensionless.
 LEVEL = 0.002
-#: Number of lags of the whiteness test, and smallest number of samples per lag.
-LAGS, SAMPLES_PER_LAG = 20, 5
+#: Number of lags of the whiteness test and of a panel, and smallest number of samples per lag of the test.
+LAGS, SHOWN_LAGS, SAMPLES_PER_LAG = 20, 60, 5
 
 
-def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
-    """(lags,) sample autocorrelation at lags 1 .. lags; NaN of equal residuals."""
-    r = residuals - np.mean(residuals)
+def autocorrelation(residuals: np.ndarray, lags: int | None = None) -> np.ndarray:
+    """(lags,) sample autocorrelation at lags 1 .. lags, by default those of a panel; NaN of equal residuals."""
+    r, lags = residuals - np.mean(residuals), lags or min(SHOWN_LAGS, len(residuals) // 4)
     power = float(r @ r) or np.nan
     return np.array([float(r[lag:] @ r[:-lag]) for lag in range(1, lags + 1)]) / power
 
 
-def ljung_box(residuals: np.ndarray, lags: int | None = None) -> tuple[float, float, int]:
-    """Ljung–Box Q of residuals (n,), its p-value and the number of lags (Ljung & Box 1978).
-
-    ``lags`` None: ``LAGS``, fewer for short records.
-    """
+def ljung_box(residuals: np.ndarray) -> tuple[float, float, int]:
+    """Ljung–Box Q of residuals (n,), its p-value and the number of lags, fewer for short records (Ljung & Box 1978)."""
     n = len(residuals)
-    lags = lags or min(LAGS, n // SAMPLES_PER_LAG)
+    lags = min(LAGS, n // SAMPLES_PER_LAG)
     rho = autocorrelation(residuals, lags)
     q = n * (n + 2.0) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
     return q, float(stats.chi2.sf(q, lags)), lags
@@ -425,6 +413,40 @@ def correlated_records(experiments: Sequence["Experiment"], values: Mapping[str,
         for label, residuals in e.records(e.local(values))
     ]
     return [one for one in tests if one.p * len(tests) < LEVEL], len(tests)
+
+
+# further columns: What columns explain of residuals beside those that the fitted parameters can take up.
+
+
+#: Directions of further columns that are shorter than this, relative to the longest one, are combinations of the others.
+COMBINATION = 1e-8
+
+
+def further_columns(known: np.ndarray, further: np.ndarray, left: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """F test for the columns ``further`` (n, q) beside those ``known`` (n, p), and the effect (q,) of each of them.
+
+    Returns
+    -------
+    F and its p-value, NaN for too few readings; correlation of the residuals ``left`` (n,) with each column, times their
+    length. What the known columns take up is projected out of both. Columns that are combinations of others count once.
+    """
+    own, columns = without(known, left, further)
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    basis = basis[:, sizes > COMBINATION * sizes[0]]
+    effects = columns.T @ own / np.maximum(np.linalg.norm(columns, axis=0), COMBINATION)
+    rank, freedom = basis.shape[1], len(own) - np.count_nonzero(known.any(axis=0)) - basis.shape[1]
+    if freedom < rank:
+        return np.nan, np.nan, effects
+    explained = float(np.sum((basis.T @ own) ** 2))
+    F = explained / rank * freedom / max(float(own @ own) - explained, np.finfo(float).tiny)
+    return F, float(stats.f.sf(F, rank, freedom)), effects
+
+
+def without(known: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
+    """What the columns ``known`` (n, p) leave of each of ``parts``, (n,) or (n, q)."""
+    size = np.linalg.norm(known, axis=0)
+    basis = np.linalg.qr(known[:, size > 0.0] / size[size > 0.0])[0]
+    return [part - basis @ (basis.T @ part) for part in parts]
 
 
 # refit: Estimates from one experiment alone, with or without some of its readings.

@@ -1,6 +1,6 @@
 """Experiments whose forward model is the capsule model: mixin, trials, and bench tests with ``forward = "capsule"``."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, Literal, Self
@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol, clock_parameters, scatter_prior, stretch
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
-from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.record import DecayRecord
-from capsule_id.experiments.free_vibration.second_fit import starts_of_motion
+from capsule_id.experiments.free_vibration.second_fit import decay_starts
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
     FrictionModel,
@@ -33,7 +33,7 @@ from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.records.tones import stated_gap
 from capsule_id.rig.model import Quantity, Rig, Table
-from capsule_id.views import Facts, Finding
+from capsule_id.views import Facts
 
 # capsule experiment: Mixin for experiments whose forward model is the capsule model, exact or smoothed.
 
@@ -139,7 +139,7 @@ OFF = Excitation(0.0, 1.0)
 SLIDES, REST = 6.0, 0.5
 
 
-class CapsuleDecay(CapsuleForward, FreeVibration):
+class CapsuleDecay(CapsuleForward, DecayRecord):
     """x_rel(t) of a rod released at the first sample, drive off, with the capsule at rest there and free to slip.
 
     Initial conditions and offset belong to the record. With ``spring`` and ``gap`` the rod may hit the support spring.
@@ -147,8 +147,6 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
 
     gap: float | None
 
-    checks = ()
-    tables = ()
     model_name = "capsule model"  # pyright: ignore[reportAssignmentType]
     #: The capsule takes energy when it slips, so that no period repeats.
     cycles = None  # pyright: ignore[reportAssignmentType]
@@ -168,10 +166,6 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         rows += clock_parameters(table, rig)
         self.about = replace(self.about, parameters=tuple(rows))
 
-    @classmethod
-    def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
-        return Experiment.second_models(records, readings)
-
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
         p = self.parameters_of(theta, theta["G"] if self.gap is None else self.gap)
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
@@ -184,8 +178,13 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         return super().unstated_errors(symbol) | {"gain"}
 
     def starts(self) -> dict[str, Start]:
-        starts = super().starts() | starts_of_motion(self, self.rough)
-        return starts | stated_starts(self.label, G=self.table.settings.gap)
+        size, rate = abs(float(self.rough.peaks[0])), np.polyfit(self.time[:5], self.values[:5], 1)[0]
+        return {
+            **decay_starts(self),
+            f"x_start[{self.label}]": Start(float(self.values[0] - equilibrium(self.values)), 0.02 * size),
+            f"y_start[{self.label}]": Start(float(rate), 0.05 * self.rough.Omega_o * size),
+            **stated_starts(self.label, G=self.table.settings.gap),
+        }
 
 
 class CapsulePushes(CapsuleForward, DynamicFriction):

@@ -16,12 +16,11 @@ class Tension:
 
     Attributes
     ----------
-    statistic : twice the increase of the log-posterior when each group has its own parameters
-    p : p-value from chi-square with 1 degree of freedom
+    p : p-value of twice the increase of the log-posterior where each group has its own parameters, from chi-square with 1
+        degree of freedom
     one, other : estimates from each group alone, SI, by name
     """
 
-    statistic: float
     p: float
     one: Mapping[str, float]
     other: Mapping[str, float]

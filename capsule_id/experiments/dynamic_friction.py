@@ -81,26 +81,13 @@ class PushSettings(SurfaceSettings):
     forward: Literal["closed", "capsule"] = "closed"
 
 
-def pushes(
-    rng: np.random.Generator,
-    mu: float,
-    v_s: float,
-    g: float,
-    speeds: np.ndarray = SPEEDS,
-    speed_sd: float = SPEED_SD,
-    distance_sd: float = DISTANCE_SD,
-    surface_scatter: float = SURFACE_SCATTER,
-) -> dict[str, np.ndarray]:
-    """Simulate a table of pushes at ``speeds`` (n,) m/s with errors ``speed_sd`` m/s and ``distance_sd`` m.
-
-    The surface's mu scatters by ``surface_scatter`` (relative) from push to push. Each argument is one quantity of the
-    protocol, so there are more than six.
-    """
-    surface = mu * (1.0 + surface_scatter * rng.standard_normal(len(speeds)))
-    distance = slide_distance(unit_law(1.0, v_s), 1.0 / g, speeds) / surface
+def pushes(rng: np.random.Generator, mu: float, v_s: float, g: float) -> dict[str, np.ndarray]:
+    """Simulate a table of pushes at ``SPEEDS`` with their errors."""
+    surface = mu * (1.0 + SURFACE_SCATTER * rng.standard_normal(len(SPEEDS)))
+    distance = slide_distance(unit_law(1.0, v_s), 1.0 / g, SPEEDS) / surface
     return {
-        "speed [m/s]": speeds + speed_sd * rng.standard_normal(len(speeds)),
-        "distance [mm]": 1e3 * (distance + distance_sd * rng.standard_normal(len(speeds))),
+        "speed [m/s]": SPEEDS + SPEED_SD * rng.standard_normal(len(SPEEDS)),
+        "distance [mm]": 1e3 * (distance + DISTANCE_SD * rng.standard_normal(len(SPEEDS))),
     }
 
 
@@ -142,7 +129,7 @@ KIND = Kind(
     parameters=(PUSH_SCATTER,),
     read_by=INSTRUMENT_ERRORS,
     make=made_by(
-        "capsule_id.experiments.dynamic_friction:DynamicFriction",
+        f"{__name__}:DynamicFriction",
         capsule="capsule_id.experiments.capsule_experiment:CapsulePushes",
     ),
     template=TEMPLATE,

@@ -146,7 +146,7 @@ class VariantPoints:
         return np.where(np.isfinite(value), value, -np.inf)
 
 
-def fit_variant(points: VariantPoints, model: FrictionModel, seed: int, particles: int = PARTICLES) -> Variant:
+def fit_variant(points: VariantPoints, model: FrictionModel, seed: int) -> Variant:
     """Fit one law; the same seed gives the same numbers."""
     rows = points.rows(model)
 
@@ -157,7 +157,7 @@ def fit_variant(points: VariantPoints, model: FrictionModel, seed: int, particle
         with np.errstate(all="ignore"):
             return points.log_likelihood(model, theta_of(z))
 
-    z, values, evidence = sequential_monte_carlo(density, len(rows), np.random.default_rng(seed), particles)
+    z, values, evidence = sequential_monte_carlo(density, len(rows), np.random.default_rng(seed))
     theta, best = theta_of(z), int(np.argmax(values))
     raw, sd = points.scaled(model, {name: column[best : best + 1] for name, column in theta.items()})
     own = {row.symbol: theta[row.symbol] for row in model.parameters}
@@ -175,10 +175,10 @@ def fit_variant(points: VariantPoints, model: FrictionModel, seed: int, particle
 
 
 def sequential_monte_carlo(
-    density: Callable[[np.ndarray], np.ndarray], dimension: int, rng: np.random.Generator, particles: int
+    density: Callable[[np.ndarray], np.ndarray], dimension: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Sample the posterior of a standard normal prior; return particles (s, d), log-likelihoods (s,), log evidence."""
-    z = rng.standard_normal((particles, dimension))
+    z = rng.standard_normal((PARTICLES, dimension))
     value, power, evidence = density(z), 0.0, 0.0
     while power < 1.0:
         step = _next_step(value, 1.0 - power)
@@ -189,14 +189,14 @@ def sequential_monte_carlo(
         root = np.linalg.cholesky(
             np.cov((z - mean).T, aweights=weight).reshape(dimension, dimension) + 1e-10 * np.eye(dimension)
         )
-        position = (rng.random() + np.arange(particles)) / particles * np.sum(weight)
-        chosen = np.minimum(np.searchsorted(np.cumsum(weight), position), particles - 1)
+        position = (rng.random() + np.arange(PARTICLES)) / PARTICLES * np.sum(weight)
+        chosen = np.minimum(np.searchsorted(np.cumsum(weight), position), PARTICLES - 1)
         z, value = z[chosen], value[chosen]
         for scale in np.geomspace(1.0, 0.1, MOVES):
             proposed = z + scale * 2.38 / np.sqrt(dimension) * rng.standard_normal(z.shape) @ root.T
             new = density(proposed)
             change = power * (new - value) - 0.5 * np.sum(proposed**2 - z**2, axis=1)
-            accepted = np.log(rng.random(particles)) < change
+            accepted = np.log(rng.random(PARTICLES)) < change
             z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
     return z, value, evidence
 

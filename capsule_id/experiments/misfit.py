@@ -38,7 +38,7 @@ def marginal_log_density(yy: Any, ay: Any, aa: Any, n: Any, xp: ModuleType = jnp
     n : length of y, (...) or one for all
     """
     if aa.shape[-1] > MANY_NUISANCES:
-        mean, log_det = _solve(ay, aa, xp)
+        mean, log_det = conditional_mean(ay, aa, xp)
         return -0.5 * (n * LOG_2PI + log_det + yy - xp.sum(ay * mean, axis=-1))
     rest, rows, log_det = yy, xp.broadcast_to(xp.eye(aa.shape[-1]), aa.shape) + aa, 0.0
     while rows.shape[-1]:
@@ -51,8 +51,8 @@ def marginal_log_density(yy: Any, ay: Any, aa: Any, n: Any, xp: ModuleType = jnp
     return -0.5 * (n * LOG_2PI + log_det + rest)
 
 
-def _solve(ay: Any, aa: Any, xp: ModuleType) -> tuple[Any, Any]:
-    """(I + A'A)^-1 A'y (..., p) and log det (I + A'A) (...), by elimination in a loop.
+def conditional_mean(ay: Any, aa: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
+    """Mean of b given y, (I + A'A)^-1 A'y (..., p), and log det (I + A'A) (...), by elimination in a loop.
 
     XLA's calls of LAPACK from two threads at once may wait for each other for ever (JAX 0.11, compiled loops).
     """
@@ -63,7 +63,8 @@ def _solve(ay: Any, aa: Any, xp: ModuleType) -> tuple[Any, Any]:
     def eliminate(k: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
         rows, log_det = carry
         row, column = (jax.lax.dynamic_index_in_dim(rows, k, axis=axis, keepdims=True) for axis in (-2, -1))
-        pivot = jax.lax.dynamic_index_in_dim(row, k, axis=-1, keepdims=True)
+        # Every pivot is 1 or more; of readings without noise, rounding may leave less.
+        pivot = jnp.maximum(jax.lax.dynamic_index_in_dim(row, k, axis=-1, keepdims=True), 1.0)
         own = jnp.reshape(jnp.arange(size) == k, (*(1,) * (rows.ndim - 2), size, 1))
         rows = jnp.where(own, row / pivot, rows - column * (row / pivot))
         return rows, log_det + jnp.log(pivot[..., 0, 0])
@@ -71,13 +72,6 @@ def _solve(ay: Any, aa: Any, xp: ModuleType) -> tuple[Any, Any]:
     start = jnp.concatenate([matrix, ay[..., None]], axis=-1), jnp.zeros(ay.shape[:-1])
     rows, log_det = jax.lax.fori_loop(0, size, eliminate, start)
     return rows[..., -1], log_det
-
-
-def conditional_mean(ay: Any, aa: Any, xp: ModuleType = jnp) -> Any:
-    """Posterior mean of b given y, (p,): (I + A'A)^-1 A'y."""
-    if aa.shape[-1] > MANY_NUISANCES:
-        return _solve(ay, aa, xp)[0]
-    return xp.linalg.solve(xp.eye(aa.shape[-1]) + aa, ay)
 
 
 def conditional_draw(ay: np.ndarray, aa: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -130,7 +124,7 @@ class ScaledMisfit:
         if self.design.shape[1] == 0:
             return self.raw / self.sd, xp.zeros(0)
         _, ay, aa = self.moments()
-        b = conditional_mean(ay, aa, xp)
+        b, _ = conditional_mean(ay, aa, xp)
         return (self.raw - self.design @ b) / self.sd, b
 
     def at_nuisance_draw(self, rng: np.random.Generator) -> np.ndarray:

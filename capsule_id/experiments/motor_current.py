@@ -26,23 +26,15 @@ class MotorSettings(Settings):
     sd_ratio: Annotated[float | None, QuantityRule("N/A")] = None
 
 
-def calibration(
-    rng: np.random.Generator, K: float, currents: np.ndarray, force_sd: float, current_sd: float
-) -> dict[str, np.ndarray]:
-    """Simulate a calibration at ``currents`` (n,) A, with reading errors in both columns, N and A."""
-    n = len(currents)
-    return {
-        "force [N]": K * currents + force_sd * rng.standard_normal(n),
-        "current [A]": currents + current_sd * rng.standard_normal(n),
-    }
-
-
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     errors = (
         f'force_sd = {{ value = {FORCE_SD:g}, unit = "N" }}',
         f'current_sd = {{ value = {CURRENT_SD:g}, unit = "A" }}',
     )
-    columns = calibration(rng, values["K"], CURRENTS, FORCE_SD, CURRENT_SD)
+    columns = {
+        "force [N]": values["K"] * CURRENTS + FORCE_SD * rng.standard_normal(len(CURRENTS)),
+        "current [A]": CURRENTS + CURRENT_SD * rng.standard_normal(len(CURRENTS)),
+    }
     return Twin((TwinTable("motor_current.csv", columns, errors),))
 
 
@@ -63,7 +55,7 @@ KIND = Kind(
     settings=MotorSettings,
     rules=(refuse_idle_sd_ratio,),
     read_by=INSTRUMENT_ERRORS,
-    make=made_by("capsule_id.experiments.motor_current:MotorCurrent"),
+    make=made_by(f"{__name__}:MotorCurrent"),
     template=TEMPLATE,
     informs="K",
     captions={"motor_current": "Counterpart of the paper's Fig. 3: the slope of the line is K."},

@@ -25,7 +25,6 @@ from capsule_id.experiments.base import (
     ValuesBySymbol,
     axis_label,
     band,
-    no_design,
     refit,
     scatter_prior,
 )
@@ -137,7 +136,7 @@ class PointTest(GroundExperiment):
 
     def design(self, n: int, xp: ModuleType = jnp) -> Any:
         """Effect (n, p) of linear nuisances on the readings, SI, each scaled to a standard normal prior."""
-        return no_design(n, xp)
+        return xp.zeros((n, 0))
 
     @property
     def masses(self) -> tuple[str, ...]:  # type: ignore[override]  # pyright: ignore
@@ -158,11 +157,7 @@ class PointTest(GroundExperiment):
         size = self.instrument(self.reading, theta)[0] if self.relative else 1.0
         return (Misfit(raw, variance, size * self.change(theta), self.design(self.n, xp)),)
 
-    def starts(self) -> dict[str, Start]:
-        """None: parameters start at the medians of their priors."""
-        return {}
-
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         """Readings against the first other column, or in order; curves hold the further columns at their means."""
         y, others = self.table.columns[self.reading], (c for c in self.table.columns.values() if c.name != self.reading)
         column = next(others, Column("trial", "1", 1.0, np.arange(1.0, self.n + 1.0)))
@@ -176,23 +171,24 @@ class PointTest(GroundExperiment):
             return (np.asarray(self.shown(values, {**held, column.name: along})) + nuisances) * y.to_display
 
         lower, upper = band(np.array([curve(draw) for draw in draws]))
-        return Comparison(
-            self.kind,
-            self.label,
-            f"{self.label}: {y.name} against {column.name}",
-            axis_label(column),
-            axis_label(y),
-            (
-                Points(
-                    self.label,
-                    x * column.to_display,
-                    self.observed * y.to_display,
-                    np.full(self.n, y.sd * y.to_display) if y.sd else None,
+        return (
+            Comparison(
+                self.kind,
+                self.label,
+                f"{self.label}: {y.name} against {column.name}",
+                axis_label(column),
+                axis_label(y),
+                (
+                    Points(
+                        self.label,
+                        x * column.to_display,
+                        self.observed * y.to_display,
+                        np.full(self.n, y.sd * y.to_display) if y.sd else None,
+                    ),
                 ),
+                (Curve("this fit", along * column.to_display, curve(theta), lower, upper),),
+                self.residuals(theta, np)[: self.n],
             ),
-            (Curve("this fit", along * column.to_display, curve(theta), lower, upper),),
-            x * column.to_display,
-            self.residuals(theta, np)[: self.n],
         )
 
 
@@ -516,9 +512,9 @@ class Line(PointTest):
             starts[f"scatter[{self.label}]"] = Start(max(sd, 1e-6 * float(np.ptp(self.observed))), 0.3)
         return starts
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        panel, (slope, intercept, _) = super().comparison(theta, draws), self.ordinary_line()
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
+        (panel,), (slope, intercept, _) = super().comparisons(theta, draws), self.ordinary_line()
         x, columns = panel.curves[0].x, self.table.columns
         paper = intercept + slope * x / columns[self.x_name].to_display
         curve = Curve("the paper's fit", x, paper * columns[self.reading].to_display, role="paper")
-        return replace(panel, curves=(*panel.curves, curve))
+        return (replace(panel, curves=(*panel.curves, curve)),)

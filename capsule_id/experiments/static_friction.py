@@ -23,12 +23,11 @@ from capsule_id.experiments.friction import (
     friction_panels,
     masses_of_pulls,
 )
-from capsule_id.experiments.friction_model import FrictionModel
-from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import INSTRUMENT_ERRORS, Prior, scatter
 from capsule_id.physics.batches import array_module
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Table
 from capsule_id.rig.schema import ColumnRule, Entry, QuantityRule
 from capsule_id.rig.toml import POSITIVE, SLOPE_ANGLE
 
@@ -92,11 +91,9 @@ def _check_ground(entry: Entry[TiltSettings]) -> None:
         raise entry.error("N0", "normal_force holds N0 too", "both", "remove N0, or normal_force", of_key=True)
 
 
-def tilts(
-    rng: np.random.Generator, mu: float, trials: int = TRIALS, tilt_sd: float = TRIAL_SD
-) -> dict[str, np.ndarray]:
-    """Simulate a table by the paper's protocol: ``trials`` tilts with scatter ``tilt_sd``, rad."""
-    angle = np.arctan(mu) + tilt_sd * rng.standard_normal(trials)
+def tilts(rng: np.random.Generator, mu: float, trials: int = TRIALS) -> dict[str, np.ndarray]:
+    """Simulate a table by the paper's protocol: ``trials`` tilts with scatter ``TRIAL_SD``."""
+    angle = np.arctan(mu) + TRIAL_SD * rng.standard_normal(trials)
     return {"angle [deg]": np.rad2deg(angle)}
 
 
@@ -137,7 +134,7 @@ KIND = Kind(
     rules=(check_normal_force, _check_tilt, _check_ground, check_load),
     parameters=(TILT_SD, PULL_SCATTER),
     read_by=INSTRUMENT_ERRORS,
-    make=made_by("capsule_id.experiments.static_friction:StaticFriction"),
+    make=lambda table, *rig: (StaticPulls if "force" in table.columns else StaticFriction).make(table, *rig),
     template=TEMPLATE,
     informs="mu",
     captions=CAPTIONS,
@@ -165,11 +162,6 @@ class StaticFriction(FrictionExperiment):
     side: Literal["board", "base"] | None = eqx.field(static=True)
 
     role, reading, scatter, relative, on_track = "static", "angle", TILT_SD, False, False
-
-    @classmethod
-    def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> tuple[FrictionExperiment, ...]:
-        kind = StaticPulls if "force" in table.columns else cls
-        return (kind(table, rig, friction),)  # pyright: ignore[reportCallIssue]
 
     def read(self, table: Table) -> tuple[dict[str, Any], dict[str, Any]]:
         """Angle, (n,) rad, and its reading error, () or (n,) rad."""

@@ -35,23 +35,17 @@ class SpringSettings(Settings):
     sd_ratio: Annotated[float | None, QuantityRule("N/m")] = None
 
 
-def static_test(
-    rng: np.random.Generator, k2: float, deflections: np.ndarray, relative_sd: float
-) -> dict[str, np.ndarray]:
-    """Simulate a static test at ``deflections`` (n,) m; the force has noise ``relative_sd`` of full scale."""
-    force = k2 * deflections
-    noise = relative_sd * np.max(np.abs(force)) * rng.standard_normal(len(force))
-    return {"deflection [mm]": 1e3 * deflections, "force [N]": force + noise}
-
-
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     tables = []
     # A generator of their own: the readings of the other tests do not depend on these errors.
     errors = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**21,)))
     for spring, k2 in by_index("k2", values).items():
         length = LENGTH * (LENGTH_OF / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
-        columns = static_test(rng, k2, DEFLECTIONS, SPRING_NOISE)
-        columns["deflection [mm]"] += 1e3 * DEFLECTION_SD * errors.standard_normal(DEFLECTIONS.size)
+        force = k2 * DEFLECTIONS
+        columns = {
+            "deflection [mm]": 1e3 * DEFLECTIONS + 1e3 * DEFLECTION_SD * errors.standard_normal(DEFLECTIONS.size),
+            "force [N]": force + SPRING_NOISE * force[-1] * rng.standard_normal(DEFLECTIONS.size),
+        }
         settings = (
             f'spring = "{spring}"',
             f'length = {{ value = {1e3 * length:.2f}, sd = {1e3 * LENGTH_SD:g}, unit = "mm" }}',
@@ -92,7 +86,7 @@ KIND = Kind(
     settings=SpringSettings,
     rules=(refuse_idle_sd_ratio,),
     read_by=INSTRUMENT_ERRORS,
-    make=made_by("capsule_id.experiments.support_spring:SupportSpring"),
+    make=made_by(f"{__name__}:SupportSpring"),
     template=TEMPLATE,
     informs="k2 of that spring",
     captions={"support_spring": "The slope of the line is the stiffness of the support spring."},

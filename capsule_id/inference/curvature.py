@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capsule_id.errors import InputError
-from capsule_id.physics.batches import pool
+from capsule_id.physics.batches import in_batches
 
 # covariance: Covariance of the parameters at a minimum of least squares, from the singular values of the Jacobian.
 
@@ -67,18 +67,6 @@ Random = np.random.RandomState
 STEP, RATIO = 0.05, 2.0
 #: Smallest sd of a parameter that can be sampled, in units in the last place of its value.
 FEWEST_UNITS = 1e3
-#: Rows of every batch. A fixed number needs one compilation only.
-BATCH = 32
-
-
-def in_batches(
-    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"], rows: int = BATCH
-) -> Float[np.ndarray, "m ..."]:
-    """Evaluate ``function`` at points (m, d) in batches of exactly ``rows`` rows, on all cores; (m, ...)."""
-    padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % rows, axis=0)])
-    chunks = [padded[i : i + rows] for i in range(0, len(padded), rows)]
-    parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
-    return np.concatenate(parts)[: len(points)]
 
 
 def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector) -> Matrix:

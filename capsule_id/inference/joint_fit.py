@@ -15,12 +15,13 @@ from capsule_id.console import stop_if_interrupted, threads
 from capsule_id.errors import InputError
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.inference import least_squares as difference_descent
-from capsule_id.inference.curvature import BATCH, covariance, in_batches
+from capsule_id.inference.curvature import covariance
 from capsule_id.inference.least_squares import LeastSquaresFit, Solver, least_squares, linearised
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.point_fit import AGREEMENT, described, dispersed_starts
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
+from capsule_id.physics.batches import BATCH, in_batches
 from capsule_id.views import counted
 
 # joint starts: Starting points of the joint fit: the bench estimates and the best of many candidates around them.

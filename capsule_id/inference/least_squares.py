@@ -17,10 +17,9 @@ from capsule_id.inference.curvature import (
     Jacobian,
     Residuals,
     column_space,
-    in_batches,
 )
 from capsule_id.inference.target import LogPosterior
-from capsule_id.physics.batches import pool
+from capsule_id.physics.batches import in_batches, pool
 from capsule_id.precision import COMPILE, COMPILE_QUICKLY
 
 # least squares: Nonlinear least squares from several starts, with the covariance of the parameters.

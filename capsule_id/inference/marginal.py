@@ -17,9 +17,10 @@ from scipy.special import wrightomega
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.inference.curvature import BATCH, in_batches, require_width
+from capsule_id.inference.curvature import require_width
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior, Scale
+from capsule_id.physics.batches import BATCH, in_batches
 from capsule_id.precision import COMPILE
 
 # quadrature: Quadrature nodes of the integrals over scatters.

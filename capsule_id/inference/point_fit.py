@@ -13,19 +13,13 @@ from scipy.linalg import solve_triangular
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import Experiment
-from capsule_id.inference.curvature import (
-    BATCH,
-    Jacobian,
-    covariance,
-    hessian,
-    in_batches,
-    jacobian,
-)
+from capsule_id.inference.curvature import Jacobian, covariance, hessian, jacobian
 from capsule_id.inference.least_squares import Solver, least_squares, linearised
 from capsule_id.inference.marginal import HEAVY, density_of
 from capsule_id.inference.result import STATED, PointFit
 from capsule_id.inference.target import LogPosterior, prior_of
 from capsule_id.parameters import is_stated
+from capsule_id.physics.batches import BATCH, in_batches
 
 # variance shares: Uncertainty budget of a point fit: how much every table and every prior contributes to the sd of a
 # parameter.

@@ -37,7 +37,7 @@ def tension(rig: Rig, one: Sequence[Experiment], other: Sequence[Experiment]) ->
     """
     joint, *apart = (_maximum(LogPosterior(rig, group)) for group in ([*one, *other], one, other))
     statistic = max(2.0 * (apart[0][0] + apart[1][0] - joint[0]), 0.0)
-    return Tension(statistic, float(stats.chi2.sf(statistic, 1)), apart[0][1], apart[1][1])
+    return Tension(float(stats.chi2.sf(statistic, 1)), apart[0][1], apart[1][1])
 
 
 def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:

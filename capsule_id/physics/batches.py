@@ -18,6 +18,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
@@ -30,6 +31,8 @@ Times = jax.Array | np.ndarray
 
 # Lanes per call of an engine: enough to fill the vector units, few enough for the second-level cache.
 CHUNK = 64
+# Points per call of another compiled function. A fixed number needs one compilation only.
+BATCH = 32
 
 
 class Record:
@@ -166,6 +169,16 @@ def folded(run: Callable[..., Result]) -> Callable[..., Result]:
         return on_leaves(*leaves)
 
     return call
+
+
+def in_batches(
+    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"], rows: int = BATCH
+) -> Float[np.ndarray, "m ..."]:
+    """Evaluate ``function`` at points (m, d) in batches of exactly ``rows`` rows, on all cores; (m, ...)."""
+    padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % rows, axis=0)])
+    chunks = [padded[i : i + rows] for i in range(0, len(padded), rows)]
+    parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
+    return np.concatenate(parts)[: len(points)]
 
 
 @lru_cache(maxsize=1)

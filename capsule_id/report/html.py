@@ -20,7 +20,7 @@ from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.context import RunRecord
 from capsule_id.experiments.kind import select_tables
 from capsule_id.inference.result import STATED, Result
-from capsule_id.parameters import Name, is_stated, symbol_of
+from capsule_id.parameters import QUANTILE_975, Name, is_stated, symbol_of
 from capsule_id.records.motion import UNDECIDED
 from capsule_id.report.columns import (
     MISSING,
@@ -171,7 +171,7 @@ def comparison_alt(item: Comparison) -> str:
     parts.append(f"curves: {', '.join(curve.label for curve in item.curves)}" if item.curves else "no curve")
     if item.residuals is not None and item.residuals.size:
         size = np.abs(item.residuals)
-        inside = np.mean(size <= figures.TWO_SIDED_95)
+        inside = np.mean(size <= QUANTILE_975)
         parts.append(f"{inside:.0%} of the residuals within ±1.96 sd, the largest {np.max(size):.2g} sd")
     flagged = sum(int(points.flagged.sum()) for points in item.points if points.flagged is not None)
     parts += [f"{flagged} rows flagged by a check"] if flagged else []
@@ -422,16 +422,15 @@ def _factor(remaining: float) -> str:
 #: The paper whose model and rig this package fits.
 NAMES = "Yang Liu, Ekaterina Pavlovskaia and Marian Wiercigroch"
 TITLE = "Experimental verification of the vibro-impact capsule model"
-JOURNAL, VOLUME, YEAR, PAGES = "Nonlinear Dynamics", 83, 2016, (1029, 1041)
-PUBLISHED = f"{JOURNAL} {VOLUME} ({YEAR}) {PAGES[0]}–{PAGES[1]}"
 PAPER = {
     "author": "Liu, Yang and Pavlovskaia, Ekaterina and Wiercigroch, Marian",
     "title": TITLE,
-    "journal": JOURNAL,
-    "volume": VOLUME,
-    "year": YEAR,
-    "pages": f"{PAGES[0]}--{PAGES[1]}",
+    "journal": "Nonlinear Dynamics",
+    "volume": "83",
+    "year": "2016",
+    "pages": "1029--1041",
 }
+PUBLISHED = "{journal} {volume} ({year}) {pages}".format(**PAPER).replace("--", "–")
 _ESCAPES = str.maketrans({"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"})
 
 

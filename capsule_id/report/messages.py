@@ -366,7 +366,7 @@ def _listed(facts: Facts) -> str:
 
 
 def _coloured_residuals(facts: Facts) -> str:
-    """The statistic, what drifts in the record, and the remedy of the model that predicts it."""
+    """The statistic, and the remedy of the model that predicts the record."""
     seen = (
         f"{facts['record']}: expected residuals without correlation in time (white); found Ljung–Box "
         f"Q = {facts['Q']:.0f} over {facts['lags']} lags "
@@ -375,7 +375,7 @@ def _coloured_residuals(facts: Facts) -> str:
     )
     remedies = {"capsule": _capsule_remedy, "decay": _decay_remedy}
     remedy = remedies.get(facts.get("model", ""), lambda facts: "Look at the residuals.")
-    return " ".join(filter(None, [seen, _drift(facts), remedy(facts)]))
+    return f"{seen} {remedy(facts)}"
 
 
 def _capsule_remedy(facts: Facts) -> str:
@@ -408,23 +408,6 @@ def _decay_remedy(facts: Facts) -> str:
     listed = " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
     them = "them" if len(words) > 1 else "it"
     return f"{present}{cut}, or remove {listed} from its entry: a second fit then chooses {them}."
-
-
-def _drift(facts: Facts) -> str:
-    """What drifts while a decay dies away."""
-    parts = []
-    if "decrement" in facts:
-        first, last = facts["decrement"]
-        law = "the damping grows with amplitude" if first > last else "the damping grows as the amplitude falls"
-        parts.append(f"its logarithmic decrement goes from {first:.3g} to {last:.3g} ({law})")
-    if "frequency" in facts:
-        first, last = facts["frequency"]
-        law = "the stiffness falls with amplitude" if first < last else "the stiffness grows with amplitude"
-        parts.append(f"its frequency goes from {first:.4g} to {last:.4g} rad/s ({law})")
-    if not parts:
-        return ""
-    large, small = facts["amplitude"]
-    return f"While the amplitude falls from {large:.2g} to {small:.2g} m, {' and '.join(parts)}."
 
 
 def _outliers(facts: Facts) -> str:

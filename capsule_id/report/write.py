@@ -9,7 +9,6 @@ import io
 import json
 import math
 import re
-import zipfile
 from collections import defaultdict
 from collections.abc import Container, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -27,7 +26,7 @@ from capsule_id.errors import InputError, writing
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.output import as_utf8, write_file
-from capsule_id.parameters import TABLE
+from capsule_id.parameters import TABLE, Name
 from capsule_id.report.columns import columns_of, errors_left_out
 from capsule_id.report.figures.style import own_style
 from capsule_id.report.html import pictures, render
@@ -36,7 +35,7 @@ from capsule_id.report.messages import finding_text, messages_of, title_of
 #: The file in the directory of a result, and the sample beside it.
 SAVED, SAMPLE = Path("figures") / "data.npz", "posterior.nc"
 _KEPT = tuple(field.name for field in fields(Result) if field.name != "registry")
-_TREE, _DIGESTS = "tree.npy", "digests"
+_TREE, _DIGESTS = "tree", "digests"
 
 
 def result_files(result: Result) -> dict[str, bytes]:
@@ -146,26 +145,17 @@ def saved_bytes(result: Result, sample: bytes) -> bytes:
     if posterior is not None:
         posterior = replace(posterior, draws=np.zeros(0), lp=np.zeros(0))
     light = replace(result, pointwise=None, prior={}, posterior=posterior)
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     text = json.dumps(_encode({name: getattr(light, name) for name in _KEPT}, arrays)).encode("utf-8")
-    members = {f"{name}.npy": _npy(values) for name, values in arrays.items()}
-    members[_TREE] = _npy(np.frombuffer(text, np.uint8))
-    digests = f"{_digest(members)}\n{hashlib.sha256(sample).hexdigest()}"
-    with zipfile.ZipFile(content := io.BytesIO(), "w", zipfile.ZIP_DEFLATED) as file:
-        for name, data in (members | {_DIGESTS: digests.encode()}).items():
-            with file.open(name, "w", force_zip64=True) as member:
-                member.write(data)
+    arrays[_TREE] = np.frombuffer(text, np.uint8)
+    arrays[_DIGESTS] = np.array([_digest(arrays), hashlib.sha256(sample).hexdigest()])
+    np.savez_compressed(content := io.BytesIO(), **arrays)
     return content.getvalue()
 
 
-def _npy(values: np.ndarray) -> bytes:
-    np.lib.format.write_array(content := io.BytesIO(), values, allow_pickle=False)
-    return content.getvalue()
-
-
-def _digest(members: Mapping[str, bytes]) -> str:
-    """Digest of names and contents."""
-    one = {name: hashlib.sha256(data).hexdigest() for name, data in members.items()}
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """Digest of names and values."""
+    one = {name: (str(x.dtype), x.shape, hashlib.sha256(x.tobytes()).hexdigest()) for name, x in arrays.items()}
     return hashlib.sha256(repr(one).encode()).hexdigest()
 
 
@@ -178,12 +168,12 @@ def load_fields(directory: Path, registry: Registry) -> dict[str, Any]:
         If ``directory`` holds no result, one that another version wrote, or a file that has changed since.
     """
     roots = {"capsule_id", *(kind.settings.__module__.partition(".")[0] for kind in registry.kinds)}
-    with _reading(directory / SAVED), zipfile.ZipFile(directory / SAVED) as file:
-        members = {name: file.read(name) for name in file.namelist()}
-        own, of_sample = members.pop(_DIGESTS).decode().split("\n")
-        _check(own, _digest(members))
-        arrays = {Path(name).stem: np.load(io.BytesIO(data), allow_pickle=False) for name, data in members.items()}
-        kept = _decode(json.loads(arrays[Path(_TREE).stem].tobytes().decode("utf-8")), arrays, roots)
+    with _reading(directory / SAVED):
+        # From bytes: NumPy leaves a damaged file open.
+        arrays = dict(np.load(io.BytesIO((directory / SAVED).read_bytes()), allow_pickle=False))
+        own, of_sample = arrays.pop(_DIGESTS).tolist()
+        _check(own, _digest(arrays))
+        kept = _decode(json.loads(arrays[_TREE].tobytes().decode("utf-8")), arrays, roots)
         posterior = {name: kept[name] for name in _KEPT}["posterior"]
     if posterior is not None:
         with _reading(directory / SAMPLE):
@@ -316,7 +306,7 @@ def data_tree(result: Result) -> xr.DataTree:
     Raises
     ------
     ValueError
-        If nothing was sampled, or a name is used both alone and as a family.
+        If nothing was sampled.
     """
     posterior, pointwise = result.posterior, result.pointwise
     if posterior is None:
@@ -424,19 +414,20 @@ def _readings(by_label: Mapping[str, np.ndarray], leading: tuple[str, ...]) -> x
 
 
 def _families(arrays: Mapping[str, np.ndarray], units: Mapping[str, str], fixed: Container[str] = ()) -> xr.Dataset:
-    """Variables (chain, draw) by name; names with brackets are stacked along the dimension of their family."""
+    """Variables (chain, draw) by name; names with brackets are stacked along the dimension of their family.
+
+    There "" is the one without a bracket: the slope of the rig beside that of one table.
+    """
     families: defaultdict[str, dict[str, np.ndarray]] = defaultdict(dict)
     for name, values in arrays.items():
-        base, _, of = name.partition("[")
-        families[base][of[:-1]] = values
+        base, of = Name.parse(name)
+        families[base][of] = values
     dataset = xr.Dataset()
     for base, members in families.items():
-        names = [f"{base}[{of}]" if of else base for of in members]
-        if base in names and len(names) > 1:
-            raise ValueError(f"{base} is used both alone and as a family: {', '.join(names)}; rename one of them")
+        names = [str(Name(base, of)) for of in members]
         # A symbol has one unit, so the first member's holds for all.
         about = {"units": units.get(names[0], ""), **({"fixed": 1} if all(name in fixed for name in names) else {})}
-        if base in names:
+        if names == [base]:
             dataset[base] = (("chain", "draw"), members[""], about)
         else:
             dimension = _DIMENSIONS.get(base, f"{base}_of")
@@ -454,7 +445,7 @@ def _members_of(dataset: xr.Dataset) -> dict[str, np.ndarray]:
             found[str(base)] = values
         else:
             members = variable[variable.dims[-1]].to_numpy()
-            found |= {f"{base}[{of}]": values[..., i] for i, of in enumerate(members)}
+            found |= {str(Name(str(base), of)): values[..., i] for i, of in enumerate(members)}
     return found
 
 

@@ -114,7 +114,7 @@ def test_a_record_that_hits_the_spring_is_described() -> None:
 def test_a_decay_is_drawn_with_the_curve_of_the_capsule_model() -> None:
     """Before: the design of the closed form, and no report."""
     e = CapsuleDecay(decay(4e-3, "capsule"), bench.rig())
-    panel = e.comparison(TRUTH | {"x_start": 4e-3, "y_start": 0.0, "noise_sd": NOISE}, [])
+    (panel,) = e.comparisons(TRUTH | {"x_start": 4e-3, "y_start": 0.0, "noise_sd": NOISE}, [])
     (points,), (curve,) = panel.points, panel.curves
     assert np.std(points.y - curve.y) == pytest.approx(NOISE, rel=0.1)
 

@@ -163,7 +163,7 @@ def test_autocorrelation_and_ljung_box() -> None:
     d = r - r.mean()
     expected = [np.sum(d[k:] * d[: 300 - k]) / np.sum(d**2) for k in range(1, 6)]
     np.testing.assert_allclose(autocorrelation(r, 5), expected, rtol=1e-12)
-    p = np.array([ljung_box(rng.standard_normal(1000), 20)[1] for _ in range(2000)])
+    p = np.array([ljung_box(rng.standard_normal(1000))[1] for _ in range(2000)])
     assert np.mean(p < 0.05) == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / 2000))
     coloured = np.convolve(rng.standard_normal(1002), [1.0, 0.5, 0.0], mode="valid")
-    assert ljung_box(coloured, 20)[1] < 1e-10
+    assert ljung_box(coloured)[1] < 1e-10

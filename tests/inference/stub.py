@@ -7,7 +7,7 @@ from types import ModuleType
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
+from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.target import LogPosterior, Scale
@@ -49,12 +49,12 @@ class Nothing(Experiment):
         return np.zeros(0)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        return (Misfit(xp.zeros(0), 1.0, 0.0, no_design(0, xp)),)
+        return (Misfit(xp.zeros(0), 1.0, 0.0, xp.zeros((0, 0))),)
 
     def starts(self) -> dict[str, Start]:
         return {}
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         raise NotImplementedError
 
 

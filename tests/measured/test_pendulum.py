@@ -101,7 +101,6 @@ def test_a_viscous_swing_is_not_taken_for_a_dry_one(tmp_path: Path) -> None:
     angle = 0.6 * np.exp(-0.52 * (time - 1.0)) * np.cos(10.9 * time) + 0.002 * rng.standard_normal(time.size)
     rig = _rig(tmp_path, time, RESOLUTION * np.round(angle / RESOLUTION))
     record = cast(FreeVibration, make_experiments(rig)[0])
-    assert record.damping_trend() == {}
     ((same,), findings) = second_models([record])
     assert same.model.symbols == ()
     assert all("dry" not in str(finding.facts["second"]) for finding in findings)

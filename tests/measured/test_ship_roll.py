@@ -5,7 +5,6 @@ c in N m s/rad and c_q in N m s²/rad². The inertia is the authors' own value, 
 bookkeeping; it is no independent measurement of the stiffness.
 """
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -60,20 +59,9 @@ def test_what_remains_is_reported(roll: Fit) -> None:
     (finding,) = [f for f in roll.findings if f.code == "residuals.white"]
     assert (finding.level, finding.experiment) == ("fail", "roll_21337")
     assert "Present in the fitted model: quadratic damping, a cubic spring" in roll.text(finding)
-    assert "the damping grows with amplitude" in roll.text(finding)
-    # The authors' cubic stiffness term is positive as well.
-    assert "the stiffness grows with amplitude" in roll.text(finding)
-
-
-def test_the_decrements_told_are_those_of_the_peaks(roll: Fit) -> None:
-    (finding,) = [f for f in roll.findings if f.code == "residuals.white"]
-    ((first, last),) = re.findall(r"logarithmic decrement goes from ([\d.]+) to ([\d.]+)", roll.text(finding))
-    _, heights = _peaks()
-    size = np.log(heights[:-1] + heights[1:])  # of neighbours: the heel drops out
-    early = -2.0 * np.polyfit(np.arange(8), size[:8], 1)[0]
-    late = -2.0 * np.polyfit(np.arange(8), size[-8:], 1)[0]
-    assert float(first) == pytest.approx(early, rel=0.15)
-    assert float(last) == pytest.approx(late, rel=0.15)
+    # Damping and stiffness grow with the amplitude; the authors' cubic stiffness term is positive as well.
+    growing = roll.summary.loc[["c_q", "k_cubic"]]
+    assert (growing["map"] > 3.0 * growing["standard_error"]).all()
 
 
 def test_quadratic_damping_and_a_cubic_spring_explain_the_decrements(roll: Fit) -> None:

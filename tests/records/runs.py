@@ -138,7 +138,7 @@ def reference() -> tuple[Known, ...]:
     known = []
     for seed, case in enumerate(read_cases().raw):
         parameters = {name: case[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
-        settings = RunSetup("s", case["Omega"], case["P_d"], case["G"])
+        settings = RunSetup("s", case["Omega"], case["P_d"], case["G"], 2000, 1e-3)
         run = make_runs({**parameters, "K": 2.0, "k2[s]": case["k2"]}, 100 + seed, (settings,))[0]
         known.append(Known(case["name"], case["label"], 1e-3 * case["mean_velocity_mm_per_s"], run))
     return tuple(known)
@@ -150,6 +150,6 @@ def longer() -> tuple[Known, ...]:
     known = []
     for seed, ((k2, mu, G, P_d, Omega), label) in enumerate(LONGER.items()):
         parameters = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 1.0, "mu": mu, "v_s": 0.3, "g": 9.81, "K": 2.0}
-        run = make_runs({**parameters, "k2[s]": k2}, 200 + seed, (RunSetup("s", Omega, P_d, G),))[0]
+        run = make_runs({**parameters, "k2[s]": k2}, 200 + seed, (RunSetup("s", Omega, P_d, G, 2000, 1e-3),))[0]
         known.append(Known(f"{k2:g} N/m, {Omega:g} rad/s", label, float("nan"), run))
     return tuple(known)

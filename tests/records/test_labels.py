@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id.experiments.forced_run.twin import GAP_SD, SAMPLES
+from capsule_id.experiments.forced_run.twin import GAP_SD
 from capsule_id.motions.response import response
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.records.motion import UNDECIDED, Contacts, MeanVelocity, measured_motion
@@ -180,7 +180,7 @@ def test_a_wrong_stated_frequency_is_found_and_does_no_harm() -> None:
 
 def test_uneven_sampling_is_a_reason() -> None:
     record = noisier(reference()[0].run, 1.0, 0)
-    record["time"] = record["time"] + np.where(np.arange(SAMPLES) % 2, 2e-4, 0.0)
+    record["time"] = record["time"] + np.where(np.arange(len(record["time"])) % 2, 2e-4, 0.0)
     motion = measured_motion(table_of(record))
     assert motion.label == UNDECIDED
     assert "evenly spaced" in motion.evidence.reasons[0]

@@ -92,7 +92,7 @@ def _line(kind: str, label: str, slope: float, rng: np.random.Generator) -> Comp
         "motor current [A]" if current else "deflection [mm]", "force [N]",
         points=(Points("measured", x, slope * x + noise, flagged=flagged),),
         curves=(Curve("this fit", x, slope * x, 0.998 * slope * x, 1.002 * slope * x),),
-        residual_x=x, residuals=noise / np.std(noise), predictive_p=0.62,
+        residuals=noise / np.std(noise), predictive_p=0.62,
     )  # fmt: skip
 
 
@@ -108,7 +108,7 @@ def _decay(number: int, rng: np.random.Generator, n: int = 1000) -> Comparison:
         "relative displacement [mm]",
         points=(Points("measured", t, clean + 0.01 * (1 + number) * residuals),),
         curves=(Curve("this fit", t, clean, clean - 0.02, clean + 0.02),),
-        residual_x=t, residuals=residuals, autocorrelation=autocorrelation, autocorrelation_bound=1.96 / np.sqrt(n),
+        residuals=residuals, autocorrelation=autocorrelation,
         predictive_p=0.55,
     )  # fmt: skip
 
@@ -161,7 +161,6 @@ COLOURED = {
     "model": "decay",
     "present": (),
     "second": False,
-    "lines": "",
 }
 CHAINS = {
     "draws": 1000, "length": 12.0, "slowest": "v_s", "rhat": 1.2, "worst": "mu", "length_wanted": 20.0,

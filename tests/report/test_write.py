@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +19,15 @@ from capsule_id.parameters import symbol_of
 from capsule_id.report import columns
 from capsule_id.report.columns import table_text
 from capsule_id.report.html import Picture
-from capsule_id.report.write import data_tree, netcdf_bytes, parameters_json, read_sample, result_files, write_result
+from capsule_id.report.write import (
+    data_tree,
+    netcdf_bytes,
+    parameters_json,
+    read_draws,
+    read_sample,
+    result_files,
+    write_result,
+)
 from capsule_id.views import Finding
 from tests.report.conftest import COLOURED
 
@@ -359,9 +366,14 @@ def test_exact_members_join_their_family(result: Result, tmp_path: Path) -> None
 def test_netcdf_refusals(result: Result, unsampled: Result) -> None:
     with pytest.raises(ValueError, match="nothing was sampled"):
         data_tree(unsampled)
-    clash = dataclasses.replace(result, fixed={"k2": 1.0})
-    with pytest.raises(ValueError, match=re.escape("k2 is used both alone and as a family")):
-        data_tree(clash)
+
+
+def test_a_name_alone_joins_the_family(result: Result, tmp_path: Path) -> None:
+    """The slope of the rig and that of one table are both sampled where both have an sd."""
+    (tmp_path / "x.nc").write_bytes(netcdf_bytes(data_tree(dataclasses.replace(result, fixed={"k2": 1.0}))))
+    draws = read_draws(tmp_path / "x.nc", 3, 0)
+    assert draws["k2"].tolist() == [1.0, 1.0, 1.0]
+    assert {"k2[soft]", "k2[medium]", "k2[stiff]"} < set(draws)
 
 
 @pytest.mark.benchmark

@@ -157,8 +157,8 @@ DRIVE_RULES = (
 
 
 #: Harmonics of the drive that are compared, and the smallest share of the acceleration's standard deviation there.
-HARMONICS, STRONG = (1, 2, 3, 4, 5), 0.15
-#: Fewest samples in a period of the drive.
+HARMONICS, STRONG = range(1, 6), 0.15
+#: Fewest samples in a period of the drive, or of one of its harmonics.
 FEWEST_SAMPLES = 4.0
 #: Admissible ratio of the recorded acceleration to that of the recorded position X1 = x_rel + x_capsule; without
 #: x_capsule its motion is unknown, so the limits are wide.
@@ -167,7 +167,6 @@ RATIO_OF_X1, RATIO_OF_X_REL = (0.5, 2.0), (0.1, 10.0)
 
 def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Report faults of the record, a stated frequency that differs from that of the current, and wrong columns."""
-    del rig
     used = slice(0, len(table.rows))
     yield from lint_times(table, used)
     time, period = table["time"], 2.0 * np.pi / stated_Omega(table)

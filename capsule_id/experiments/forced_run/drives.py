@@ -9,13 +9,22 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy import stats
 from scipy.integrate import solve_ivp
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, autocorrelation, axis_label, band, stretch
+from capsule_id.experiments.base import (
+    LEVEL,
+    Start,
+    ValuesBySymbol,
+    autocorrelation,
+    axis_label,
+    band,
+    further_columns,
+    stretch,
+)
 from capsule_id.experiments.capsule_experiment import lag_of
 from capsule_id.experiments.context import Fitted, RunRecord
+from capsule_id.experiments.forced_run.declaration import FEWEST_SAMPLES, SETTLING_PERIODS
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
@@ -33,7 +42,7 @@ from capsule_id.physics.model import (
 )
 from capsule_id.records.motion import fit_mean_velocity, measured_motion
 from capsule_id.records.tones import relative_position, stated_gap, stated_Omega, tone_at
-from capsule_id.records.view import view_record
+from capsule_id.records.view import FILTER_ORDER, view_record
 from capsule_id.rig.filters import choose_window, median_step, sampling_step, savitzky_golay, window_samples
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTable
@@ -186,8 +195,8 @@ def check_predictable(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
 # period of a periodic motion. Coloured noise can hide it from a test of whiteness: it is slow beside the samples.
 
 
-#: Largest number of harmonics of the excitation; fewest samples of a period for each of them.
-HARMONICS, SAMPLES_PER_HARMONIC = 10, 4
+#: Largest number of harmonics of the excitation.
+HARMONICS = 10
 #: Fewest whole periods of a record: in fewer ones a slow error of the noise looks like a repeated one.
 FEWEST_PERIODS = 4
 
@@ -214,16 +223,12 @@ def repetition(run: CapsuleRun, residuals: Float[np.ndarray, " n"]) -> tuple[flo
     """F statistic of the harmonics of the excitation in ``residuals``, and its p-value; None for a short record."""
     cycles = run.cycles
     periods = float(cycles[-1] - cycles[0])
-    number = min(HARMONICS, int(len(cycles) / periods / SAMPLES_PER_HARMONIC))
-    freedom = len(cycles) - 2 * number - 1
-    if periods < FEWEST_PERIODS or number < 1 or freedom < 1:
+    number = min(HARMONICS, int(len(cycles) / periods / FEWEST_SAMPLES))
+    if periods < FEWEST_PERIODS or number < 1:
         return None
     angle = 2.0 * np.pi * np.outer(cycles, np.arange(1, number + 1))
-    design = np.column_stack([np.ones(len(cycles)), np.cos(angle), np.sin(angle)])
-    rest = residuals - design @ np.linalg.lstsq(design, residuals, rcond=None)[0]
-    own, whole = float(np.sum(rest**2)), float(np.sum((residuals - np.mean(residuals)) ** 2))
-    F = (whole - own) / (2 * number) / max(own / freedom, np.finfo(float).tiny)
-    return F, float(stats.f.sf(F, 2 * number, freedom))
+    harmonics = np.column_stack([np.cos(angle), np.sin(angle)])
+    return further_columns(np.ones((len(cycles), 1)), harmonics, residuals)[:2]
 
 
 # tables: Tables of forced runs: nondimensional groups and predicted motion.
@@ -310,10 +315,6 @@ def _stacked(draws: Sequence[ValuesBySymbol]) -> dict[str, np.ndarray]:
 
 #: Channels that depend on the motion; the current is the drive itself.
 SHOWN = {"x_rel": "x_rel", "x_capsule": "capsule", "acceleration_rod": "rod's acceleration"}
-#: Number of lags of an autocorrelation.
-LAGS = 60
-#: Polynomial order of the Savitzky–Golay filter for the measured phase portrait.
-PORTRAIT_ORDER = 3
 
 
 def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
@@ -324,7 +325,7 @@ def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
     offset = run.scaled(theta, np)[index].at_nuisance_mean(np)[1][0] * run.channels[index].width
     x, y = np.asarray(motion.x_rel) + offset, np.asarray(motion.Y1 - motion.Y2)
     try:
-        window = choose_window(run.time, values, PORTRAIT_ORDER)
+        window = choose_window(run.time, values, FILTER_ORDER)
         recorded, fitted = (_filtered(run.time, side, window) for side in (values, x))
     except InputError:
         return []
@@ -345,15 +346,11 @@ def _filtered(time: np.ndarray, values: np.ndarray, window: float) -> tuple[np.n
     """Smoothed value and rate, without the half window at both ends, where the derivative is inaccurate."""
     half = window_samples(window, sampling_step(time)) // 2
     inside = slice(half, len(time) - half)
-    value, rate = (savitzky_golay(time, values, window, PORTRAIT_ORDER, derivative=n) for n in (0, 1))
+    value, rate = (savitzky_golay(time, values, window, FILTER_ORDER, derivative=n) for n in (0, 1))
     return value[inside], rate[inside]
 
 
 # runs: Runs by drive. What the paper's protocol and figures take from a harmonic force is left out of the others.
-
-
-#: Periods before the first sample from which pulses act: a lag forgets its start in a few periods.
-EARLIER_PERIODS = 50.0
 
 
 class OtherRun(CapsuleRun):
@@ -361,9 +358,6 @@ class OtherRun(CapsuleRun):
 
     checks = (check_predictable, check_repeated)
     tables = (predicted_motion,)
-
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        return self.comparisons(theta, draws)[0]
 
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         """Return a panel per channel (prediction, 95 % band, residuals, autocorrelation), then the phase portrait.
@@ -391,10 +385,8 @@ class OtherRun(CapsuleRun):
                     axis_label(column),
                     (Points(self.label, self.time, channel.values * unit),),
                     (Curve("this fit", self.time, fitted * unit, *limits),),
-                    self.time,
                     residuals,
-                    autocorrelation(residuals, min(LAGS, len(self.time) // 4)),
-                    1.96 / float(np.sqrt(len(self.time))),
+                    autocorrelation(residuals),
                 )
             )
         return (*panels, *(_portrait(self, theta) if "x_rel" in self.names else []))
@@ -429,7 +421,6 @@ class RecordedRun(OtherRun):
 
     current: np.ndarray
 
-    has_phase = False
     inputs = ("current",)
 
     def read_drive(self, table: Table, rig: Rig) -> None:
@@ -470,7 +461,8 @@ class PulseRun(OtherRun):
     def simulated(
         self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
     ) -> Trajectory:
-        earlier = EARLIER_PERIODS * 2.0 * np.pi / self.Omega
+        # A lag forgets its start in a few periods.
+        earlier = SETTLING_PERIODS * 2.0 * np.pi / self.Omega
         return super().simulated(theta, p, e, jnp.asarray(times) - self.first + earlier, initial)
 
 

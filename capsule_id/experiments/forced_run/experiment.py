@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Start, ValuesBySymbol, autocorrelation, clock_parameters, stated_rate, stretch
+from capsule_id.experiments.base import (
+    Start,
+    ValuesBySymbol,
+    autocorrelation,
+    clock_parameters,
+    scatter_prior,
+    stated_rate,
+    stretch,
+)
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters, stated_starts
 from capsule_id.experiments.forced_run.declaration import (
     CAPSULE_START,
@@ -96,12 +104,8 @@ class Channel(eqx.Module):
 # out too where their sd is stated. X2 = 0 at the first sample, because the offset of x_capsule is free.
 
 
-#: Default prior of a channel's noise, without reading error: log-normal, median 1 % of its range, factor 100.
-NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
 #: Default prior of the current's amplitude: log-normal about half its range.
 AMPLITUDE_FACTOR = 3.0
-#: sd of the normal prior of the drive's phase, rad; wide but proper.
-PHASE_WIDTH = np.pi
 #: Largest lag-1 correlation of the noise at which a fit starts.
 LARGEST_CORRELATION = 0.99
 
@@ -151,8 +155,7 @@ class CapsuleRun(CapsuleForward):
 
     #: Whether the record prescribes the motion of the rod.
     prescribed: ClassVar[bool] = False
-    #: Whether the phase of the drive is a parameter, and channels that are inputs, not readings.
-    has_phase: ClassVar[bool] = True
+    #: Channels that are inputs, not readings.
     inputs: ClassVar[tuple[str, ...]] = ()
     time_series = True
 
@@ -226,15 +229,14 @@ class CapsuleRun(CapsuleForward):
             rows += stated_parameters("P_d", settings.P_d, whole)
         rows += [parameter("K")] if "current" in self.inputs else []
         rows += [*stated_parameters("P_on", settings.P_on, kind="normal"), *lag_of(self.table, self.rig)[0]]
-        if self.has_phase and not self.prescribed:
-            rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
+        if not (self.inputs or self.prescribed):
+            rows.append(parameter("phase", whole, Prior("normal", 0.0, np.pi)))  # wide but proper
         length = NUISANCE_WIDTH * self.rough.length
         position, rate = Prior("normal", 0.0, length), Prior("normal", 0.0, self.Omega * length)
         rows += [] if self.settled else [parameter("x_start", of, position)]
         rows += [] if self.settled or self.prescribed else [parameter("y_start", of, rate)]
         rows += [CAPSULE_START.named(of, rate)] if self.moves else []
-        sds = [Prior("lognormal", NOISE_MEDIAN * channel.extent, NOISE_FACTOR) for channel in self.channels]
-        rows += [NOISE[name].named(whole, prior) for name, prior in zip(self.names, sds, strict=True)]
+        rows += [NOISE[channel.name].named(whole, scatter_prior(channel.extent)) for channel in self.channels]
         return [*rows, *(CORRELATION[name].named(whole) for name in self.names if self.coloured)]
 
     def unstated_errors(self, symbol: str) -> set[str]:
@@ -462,10 +464,10 @@ PART_GROWTH, PART_PERIODS = 30.0, 2.0
 #: Initial errors of the difference quotients, relative to the motion; factors up to this are read off; instants of a
 #: record at which they are read.
 STEP, MEASURABLE, INSTANTS = 1e-11, 1e8, 8
-#: Trial speeds of the capsule at the first sample, m/s. Logarithmic spacing resolves slow and fast sliding.
-TRIAL_SPEEDS = np.concatenate([-np.geomspace(60e-3, 0.5e-3, 13), [0.0], np.geomspace(0.5e-3, 60e-3, 13)])
-#: Index of zero speed in ``TRIAL_SPEEDS``.
-ZERO_SPEED = 13
+#: Trial speeds of the capsule at the first sample, m/s, and index of zero among those of both directions. Logarithmic
+#: spacing resolves slow and fast sliding.
+_SPEEDS = np.geomspace(0.5e-3, 60e-3, 13)
+TRIAL_SPEEDS, ZERO_SPEED = np.concatenate([-_SPEEDS[::-1], [0.0], _SPEEDS]), len(_SPEEDS)
 #: Number of Gauss–Newton steps.
 GAUSS_NEWTON_STEPS = 5
 #: Steps of the difference quotients, and largest Gauss–Newton steps, of x_rel, m, and of the rod's speed, m/s.
@@ -512,9 +514,9 @@ def better_start(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float] | N
     best, where = np.full(len(speeds), np.inf), rod
     for _ in range(GAUSS_NEWTON_STEPS):
         miss = np.stack([_misses(moving, theta, *one, speeds) for one in rod + offsets[..., None]])
-        squares = np.sum(miss[0] ** 2, axis=1)
-        better = squares < best
-        best, where = np.where(better, squares, best), np.where(better, rod, where)
+        cost = 0.5 * np.sum(miss[0] ** 2, axis=1)
+        better = cost < best
+        best, where = np.where(better, cost, best), np.where(better, rod, where)
         slope = (miss[1:] - miss[0]) / DIFFERENCE_STEPS[:, None, None]
         normal = np.einsum("iln,jln->lij", slope, slope)
         pull = np.einsum("iln,ln->li", slope, miss[0])
@@ -523,11 +525,11 @@ def better_start(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float] | N
         step = -np.einsum("lij,lj->il", np.linalg.pinv(normal), pull)
         rod = rod + np.clip(step, -LARGEST_STEPS, LARGEST_STEPS)
     found = int(np.argmin(best))
-    if 0.5 * (best[ZERO_SPEED] - best[found]) < LOG_LIKELIHOOD_RATIO:
+    if best[ZERO_SPEED] - best[found] < LOG_LIKELIHOOD_RATIO:
         found = ZERO_SPEED
     # The last speed is that of ``theta``.
     same_kind = np.sign(speeds[found]) == (np.sign(own) if run.moves else 0.0)
-    if same_kind or (0.5 * (best[-1] - best[found]) < LOG_LIKELIHOOD_RATIO and speeds[found] != 0.0):
+    if same_kind or (best[-1] - best[found] < LOG_LIKELIHOOD_RATIO and speeds[found] != 0.0):
         return None
     x, Y1 = where[:, found].tolist()
     speed = float(speeds[found])

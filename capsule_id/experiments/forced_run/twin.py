@@ -14,9 +14,6 @@ from capsule_id.parameters import QUANTILE_975
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, rod_acceleration, status_message
 from capsule_id.physics.simulation import simulate
 
-#: Number of samples of a record, and time between two, s, where a setup states none.
-SAMPLES, STEP = 2000, 1e-3
-
 
 @dataclass(frozen=True)
 class RunSetup:
@@ -26,8 +23,8 @@ class RunSetup:
     Omega: float
     P_d: float
     G: float
-    samples: int = SAMPLES
-    step: float = STEP
+    samples: int
+    step: float
 
 
 #: Runs of the synthetic rig: one near the paper's Fig. 6, one of its Fig. 11, two of its Fig. 10. The shortest contact has

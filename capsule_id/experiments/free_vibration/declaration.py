@@ -50,17 +50,10 @@ def measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
 
 
 def decay(
-    rng: np.random.Generator,
-    k1: float,
-    c: float,
-    m1: float,
-    release: float,
-    relative_sd: float,
-    duration: float = 0.5,
-    rate: float = 2000.0,
+    rng: np.random.Generator, k1: float, c: float, m1: float, release: float, relative_sd: float
 ) -> dict[str, np.ndarray]:
-    """Simulate a decay from rest at ``release`` m at time 0; the noise sd is ``relative_sd`` of the release."""
-    time = np.arange(round(duration * rate)) / rate
+    """Simulate 0.5 s of a decay from rest at ``release`` m, at 2 kHz; the noise sd is ``relative_sd`` of the release."""
+    time = np.arange(1000) / 2000.0
     x = release * viscous_basis(time, k1, c, m1, np)[:, 0]
     return {"time [s]": time, "x_rel [mm]": 1e3 * (x + relative_sd * release * rng.standard_normal(time.size))}
 

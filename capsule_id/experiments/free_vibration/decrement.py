@@ -1,10 +1,5 @@
 """Viscous decays of any damping, and the paper's estimator of k1 and c by frequency and logarithmic decrement (section 2.2).
 
-The trend of damping and frequency over the amplitude is an indication, not a test. A viscous decay with a linear
-spring has the same logarithmic decrement and frequency at every amplitude. As the amplitude falls, quadratic
-damping decreases the decrement, and dry friction increases it. A drift of the frequency indicates a stiffness
-that depends on the amplitude.
-
 This module loads no JAX: the commands set its options after they have read a rig.
 """
 
@@ -21,7 +16,6 @@ from scipy.optimize import least_squares, nnls
 from capsule_id.records.release import shortened
 from capsule_id.records.tones import frequency_of, length_of_motion, noise_level
 from capsule_id.rig.filters import dominant_frequency
-from capsule_id.views import Facts
 
 #: Largest damping ratio of a decay by half cycles. They are wrong by 3e-6 of the amplitude there, by 2e-3 at 0.9.
 STRONGEST = 0.7
@@ -32,14 +26,8 @@ PEAK_NOISE_RATIO = 4.0
 #: Smallest peak as a fraction of the record's range, which excludes a noiseless tail. Smoothing rounds the jumps of an
 #: acceleration where dry friction turns, so that small peaks remain after the rod sticks.
 PEAK_RANGE_RATIO, PEAK_RANGE_RATIO_OF_JUMPS = 0.005, 0.05
-#: The end of a record still oscillates where its range exceeds this fraction of the whole record's range.
+#: A record still swings where its range, or its distance from rest, exceeds this fraction of the whole record's range.
 SWINGING_RATIO = 0.05
-#: Smallest reported drift, in standard errors; the limit is high because neighbouring peaks are correlated.
-REPORTED = 5.0
-#: Smallest number of peaks; fewer do not determine the scatter about a parabola.
-FEWEST_HALF_CYCLES = 6
-#: Smallest peak in noise standard deviations; noise biases lower peaks upwards.
-TREND_NOISE_RATIO = 20.0
 #: Grid of the search for a viscous decay: frequencies from this many rad over the record on and their number, damping
 #: ratios of all of them and of those near the peak of the spectrum, and number of its best points that are refined.
 SLOWEST, WIDE_POINTS, NEAR_POINTS, REFINED = 0.3, 48, 9, 3
@@ -48,8 +36,6 @@ LIGHT_RATIOS, STRONG_RATIOS = (0.001, 0.01, 0.03, 0.1), (0.2, 0.4, 0.7, 1.0, 1.5
 SMALLEST_RATIO, LARGEST_SEARCHED, LARGEST_RATIO = 1e-6, 30.0, 0.9
 #: Unknowns of a viscous decay: k1, c, two initial conditions, offset.
 UNKNOWNS = 5
-#: Smallest distance from rest of a swing, relative to the record's range.
-SMALLEST_SWING = 0.05
 #: Samples that are searched: at least, at most on the grid, and at most in the refinement.
 FEWEST_SEARCHED, MOST_SEARCHED, MOST_REFINED = 16, 1000, 20_000
 #: Spectra with fewer periods are checked by a fit; its damping ratio beyond which a spectrum may have no peak.
@@ -317,9 +303,9 @@ def likelihood_gain(one: ViscousFit, other: ViscousFit) -> float:
 def swings_enough(values: np.ndarray) -> bool:
     """Whether a record passes its rest position twice, or once where it then stays there."""
     size = (values - equilibrium(values)) / np.ptp(values)
-    smallest = max(SMALLEST_SWING, PEAK_NOISE_RATIO * noise_level(values) / float(np.ptp(values)))
+    smallest = max(SWINGING_RATIO, PEAK_NOISE_RATIO * noise_level(values) / float(np.ptp(values)))
     swings = int(np.count_nonzero(np.diff(np.sign(size[np.abs(size) > smallest]))))
-    stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SMALLEST_SWING
+    stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SWINGING_RATIO
     # Where friction stops the rod, its two strokes show their duration and what each of them loses.
     return swings >= (1 if stuck else 2)
 
@@ -351,45 +337,6 @@ def damping_of_peaks(decrement: Decrement, m1: float, deflection: float, symbols
     scale = np.linalg.norm(design, axis=0)
     parts = nnls(design / scale, -np.diff(size))[0] / scale
     return dict(zip(chosen, (float(part) for part in parts), strict=True))
-
-
-def _ends(values: np.ndarray) -> np.ndarray:
-    """Slopes (2,) per half cycle of a parabola through ``values`` (p,) at both ends; NaN where they do not differ.
-
-    The difference counts where it exceeds the scatter of the values.
-    """
-    index = np.arange(len(values)) - 0.5 * (len(values) - 1)
-    coefficients = np.polyfit(index, values, 2)
-    rest = values - np.polyval(coefficients, index)
-    design = np.vander(index, 3)
-    variance = float(rest @ rest) / (len(values) - 3) * np.linalg.inv(design.T @ design)[0, 0]
-    drifts = abs(coefficients[0]) > REPORTED * np.sqrt(variance)
-    return np.polyval(np.polyder(coefficients), index[[0, -1]]) if drifts else np.full(2, np.nan)
-
-
-def trend(decrement: Decrement, noise: float) -> Facts:
-    """Report quantities that drift as the amplitude falls, SI; empty without drift or with too few peaks.
-
-    Parameters
-    ----------
-    decrement : decrement of the smoothed record
-    noise : noise sd, m; peaks after the first one below ``TREND_NOISE_RATIO`` times it are ignored
-
-    Returns
-    -------
-    ``amplitude`` (m), and of ``decrement`` (1) and ``frequency`` (rad/s) those that drift: first and last value each.
-    """
-    height = np.abs(decrement.peaks)
-    low = np.flatnonzero(height < TREND_NOISE_RATIO * noise)
-    count = int(low[0]) if len(low) else len(height)
-    if count < FEWEST_HALF_CYCLES:
-        return {}
-    # Neighbouring peaks lie on opposite sides of the equilibrium, so their mean cancels its error.
-    size = 0.5 * (height[1:count] + height[: count - 1])
-    middle = 0.5 * (decrement.times[1:count] + decrement.times[: count - 1])
-    found = {"decrement": -2.0 * _ends(np.log(size)), "frequency": np.pi / _ends(middle)}
-    facts = {name: tuple(ends.tolist()) for name, ends in found.items() if np.isfinite(ends).all()}
-    return {"amplitude": (float(size[0]), float(size[-1])), **facts} if facts else {}
 
 
 def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:

@@ -9,18 +9,24 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, refit
+from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, further_columns, refit
 from capsule_id.experiments.context import Check, Fitted
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (
+    FEWEST_HALF_SWINGS,
     check_hidden_terms,
-    further_columns,
     sensitivities,
     zero_jumps,
 )
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
-from capsule_id.experiments.free_vibration.second_fit import Screening, decay_starts, nested_starts, second_models
+from capsule_id.experiments.free_vibration.second_fit import (
+    SHORTEST,
+    Screening,
+    decay_starts,
+    nested_starts,
+    second_models,
+)
 from capsule_id.parameters import parameter
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import sampling
@@ -30,16 +36,12 @@ from capsule_id.views import Facts, Finding, Level, ResultTable
 
 #: Joint sds apart from which halves of a decay disagree or a force is seen, and from which that fails.
 DISAGREE, FAIL = 3.0, 4.0
-#: Fewest readings and half cycles of a half; fewest half cycles that a later start leaves.
-FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
 INTERVALS, READINGS_PER_INTERVAL = 12, 5
 #: Largest part of a drift that is as fast as the motion, relative to the motion.
 FAST_DRIFT = 0.01
 #: Largest part of a drift that is as fast as the motion, relative to the residuals left: about half of what white noise gives.
 FAST_NOISE = 0.25
-#: Distance from 0, in sds, of a force that a second fit has found and that counts as seen.
-FARTHER = 3.0
 #: Smallest ratio of the residuals of the larger half of the amplitudes to those of the smaller half that counts.
 LARGER = 1.3
 #: Steps of the readings in which a motion is lost, and fewest readings before that.
@@ -164,7 +166,7 @@ def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Find
             (symbol,),
         )
         for symbol, e in found.items()
-        if z[symbol] < FARTHER
+        if z[symbol] < DISAGREE
     ]
 
 
@@ -206,7 +208,7 @@ def size_of_residuals(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, flo
     ratio = float(np.sqrt(np.mean(residuals[large] ** 2) / np.mean(residuals[~large] ** 2)))
     trend = stats.spearmanr(amplitude, residuals, alternative="greater")
     p = float(trend.pvalue)  # pyright: ignore[reportAttributeAccessIssue]  (SciPy types the result as a tuple)
-    return {"ratio": ratio, "p": p, "stated": e.stated_words, **later_start(e)}, p if ratio > LARGER else 1.0
+    return {"ratio": ratio, "p": p, **later_start(e)}, p if ratio > LARGER else 1.0
 
 
 def later_start(e: DecayRecord) -> Facts:
@@ -214,7 +216,7 @@ def later_start(e: DecayRecord) -> Facts:
     size = np.abs(e.values - equilibrium(e.values))
     begin = int(np.flatnonzero(size > 0.5 * np.max(size))[-1]) + 1
     left = e.time[begin:][: length_of_motion(e.values[begin:])] if begin < len(e.time) else e.time[:0]
-    if len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_CYCLES:
+    if len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_SWINGS // 2:
         return {"start": None}
     digits = max(0, int(np.ceil(-np.log10(median_step(e.time)))))
     return {"start": float(np.round(decay_window(e.table)[0][0] + e.time[begin], digits))}
@@ -257,8 +259,8 @@ def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | Non
         offsets += [ahead & (place == i) for i in range(number)]
         limits += list(itertools.pairwise(edges))
     known = np.column_stack([design, *moved.values()])
-    p, effects = further_columns(*(e.whitened(theta, x) for x in (known, np.stack(offsets, axis=1), left)))
-    if p is None:
+    _, p, effects = further_columns(*(e.whitened(theta, x) for x in (known, np.stack(offsets, axis=1), left)))
+    if np.isnan(p):
         return None
     low, high = np.array(limits[np.argmax(np.abs(effects))]) * e.column.to_display
     return {"p": p, "low": float(low), "high": float(high), "unit": e.column.unit, **later_start(e)}, p
@@ -269,10 +271,10 @@ def _halves(e: DecayRecord) -> list[DecayRecord]:
     decrement = e.decrement()
     # The acceleration jumps where the rod turns, so difference quotients give no standard errors.
     jumps = e.order == 2 and "dry" in e.model.damping
-    if decrement is None or len(decrement.times) < 2 * FEWEST_HALF_CYCLES or jumps:
+    if decrement is None or len(decrement.times) < FEWEST_HALF_SWINGS or jumps:
         return []
     time = e.whole[0][e.whole[0] <= decrement.times[-1]]
-    if len(time) < 2 * FEWEST_READINGS * e.model.thin:
+    if len(time) < 2 * SHORTEST * e.model.thin:
         return []
     begin = float(decay_window(e.table)[0][0])
     middle, end = begin + float(time[len(time) // 2]), begin + float(time[-1])
@@ -363,6 +365,12 @@ class FreeVibration(DecayRecord):
         return nested_starts(self)
 
     def noise_facts(self) -> Facts:
-        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.lines}
-        facts |= {"tone": other_tone(self.time, self.values)}
-        return {"model": "decay", "stated": self.stated_words, **facts, **self.damping_trend(), **later_start(self)}
+        present, tone = self.model.additions, other_tone(self.time, self.values)
+        facts = {
+            "model": "decay",
+            "present": present,
+            "second": self.replaced,
+            "tone": tone,
+            "stated": self.stated_words,
+        }
+        return {**facts, **later_start(self)}

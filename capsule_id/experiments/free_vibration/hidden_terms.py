@@ -8,18 +8,19 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lsim
 
-from capsule_id.experiments.base import ValuesBySymbol, stretch
+from capsule_id.experiments.base import ValuesBySymbol, stretch, without
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FURTHER,
+    READINGS_PER_PERIOD,
     block_size,
     decay_window,
     natural_units,
 )
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord
-from capsule_id.parameters import parameter
+from capsule_id.parameters import QUANTILE_975, parameter
 from capsule_id.views import Facts, Finding, Level
 
 # sensitivities: Effects of the parameters on the readings of a decay, and of forces that the fitted model lacks.
@@ -29,8 +30,6 @@ from capsule_id.views import Facts, Finding, Level
 SENSITIVITY_STEP, SMALLEST_C = 1e-5, 0.01
 #: Points per period, and fewest points, of the responses to further forces.
 RESPONSE_POINTS, FEWEST_POINTS = 60, 200
-#: Directions of further columns that are shorter than this, relative to the longest one, are combinations of the others.
-COMBINATION = 1e-8
 
 
 def sensitivities(
@@ -80,32 +79,6 @@ def force_responses(e: DecayRecord, theta: Mapping[str, float]) -> dict[str, np.
     return found
 
 
-def further_columns(known: np.ndarray, further: np.ndarray, left: np.ndarray) -> tuple[float | None, np.ndarray]:
-    """F test for the columns ``further`` (n, q) beside those ``known`` (n, p), and the effect (q,) of each of them.
-
-    Returns
-    -------
-    p-value, None for too few readings; correlation of the residuals ``left`` (n,) with each column, times their length. What
-    the known columns take up is projected out of both. Columns that are combinations of others count once.
-    """
-    own, columns = without(known, left, further)
-    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    basis = basis[:, sizes > COMBINATION * sizes[0]]
-    effects = columns.T @ own / np.maximum(np.linalg.norm(columns, axis=0), COMBINATION)
-    rank, freedom = basis.shape[1], len(own) - np.count_nonzero(known.any(axis=0)) - basis.shape[1]
-    if freedom < rank:
-        return None, effects
-    explained = float(np.sum((basis.T @ own) ** 2))
-    return float(stats.f.sf(explained / rank * freedom / (float(own @ own) - explained), rank, freedom)), effects
-
-
-def without(known: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
-    """What the columns ``known`` (n, p) leave of each of ``parts``, (n,) or (n, q)."""
-    size = np.linalg.norm(known, axis=0)
-    basis = np.linalg.qr(known[:, size > 0.0] / size[size > 0.0])[0]
-    return [part - basis @ (basis.T @ part) for part in parts]
-
-
 def _units(e: Decay, theta: Mapping[str, float]) -> dict[str, float]:
     """Natural units of the parameters of a decay, SI."""
     size, k1, m1 = e.largest_deflection, theta["k1"], theta["m1"]
@@ -117,10 +90,10 @@ def _units(e: Decay, theta: Mapping[str, float]) -> dict[str, float]:
 # zero: A zero of the sensor that jumps where the rod turns, as of an encoder that loses counts or of a loose sensor.
 
 
-#: Half swings that are looked at, from the release on, and fewest of them.
+#: Half swings that are looked at, from the release on, and fewest of a record that is judged.
 MOST_HALF_SWINGS, FEWEST_HALF_SWINGS = 60, 8
-#: Most and fewest readings, or means of readings, per half swing, and fewest of all, without those near turning points.
-MOST_READINGS, FEWEST_READINGS, FEWEST_OF_ALL = 64, 6, 200
+#: Fewest readings, or means of readings, per half swing, and fewest of all, without those near turning points.
+FEWEST_READINGS, FEWEST_OF_ALL = 6, 200
 #: Readings nearer to a turning point than this part of a half swing are left out: a zero may jump a little later.
 NEAR = 0.1
 #: A rod moves where it is faster than this part of its largest speed.
@@ -147,7 +120,7 @@ def zero_jumps(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | N
         return None
     begin = float(decay_window(e.table)[0][0])
     settings = replace(e.table.settings, start=begin, stop=begin + float(min(end, time[-1])))
-    thin = block_size(time[time <= end], values[time <= end], 2.0 * MOST_READINGS)
+    thin = block_size(time[time <= end], values[time <= end], 4.0 * READINGS_PER_PERIOD)
     model = replace(e.model, thin=thin, noise="white", drift="none")
     part = e.with_model(model, table=replace(e.table, settings=settings))
     left, design, moved = sensitivities(part, theta)
@@ -197,8 +170,6 @@ def _least_squares(known: np.ndarray, columns: np.ndarray, values: np.ndarray) -
 # the records allow, and the values beside it.
 
 
-#: Probability that a further force is below its limit.
-LIMIT = 0.975
 #: Changes of c and of k1 by a force at its limit that matter: relative to the value, and in standard errors.
 CHANGES: Mapping[str, float] = {"c": 0.2, "k1": 0.05}
 CHANGE_IN_ERRORS = 3.0
@@ -225,13 +196,12 @@ class Hidden:
     errors: Mapping[str, float]
 
     def limits(self, signed: bool) -> tuple[float, float]:
-        """Smallest and largest value, SI, at the level ``LIMIT``; of one that is not ``signed`` the smallest is 0."""
+        """Ends of the 95 % interval, SI; of one that is not ``signed``, 0 and the 97.5 % quantile."""
         if signed:
-            width = self.sd * float(stats.norm.isf(1.0 - LIMIT))
-            return self.estimate - width, self.estimate + width
+            return self.estimate - QUANTILE_975 * self.sd, self.estimate + QUANTILE_975 * self.sd
         # Far below zero the posterior above zero is exponential: its limit goes to 0.
         ratio = max(self.estimate / self.sd, LOWEST)
-        beyond = (1.0 - LIMIT) * float(stats.norm.cdf(ratio))
+        beyond = float(stats.norm.sf(QUANTILE_975) * stats.norm.cdf(ratio))
         return 0.0, self.sd * (ratio + float(stats.norm.isf(beyond)))
 
 
@@ -249,12 +219,11 @@ def check_hidden_terms(records: Sequence[Decay], fit: Fitted) -> list[Finding]:
         theta = members[0].local(fit.values)
         # No record of a decay that does not swing excludes these forces, so the stated model is believed.
         swings = theta["c"] < 2.0 * STRONGEST * np.sqrt(theta["k1"] * theta["m1"])
+        level: Level = "fail" if swings else "warn"
         facts = {"labels": [e.label for e in members], "offers_cubic": offers_cubic, "swings": swings}
         compared += facts["labels"]
         findings += [
-            Finding("decays.hidden", "fail", {**facts, **changed}, parameters=(name,))
-            if swings
-            else Finding("decays.hidden", "warn", {**facts, **changed})
+            Finding("decays.hidden", level, {**facts, **changed}, parameters=(name,) if swings else ())
             for name in CHANGES
             if (changed := _change(name, fit.values[name], {symbol: terms[symbol] for symbol in offered}))
         ]

@@ -210,7 +210,6 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
         "file": table.file,
         "rest": decay.rest,
         "start": start,
-        "found": decay.start,
         "before": "slow approach to the first turning point" if decay.pushed else "rest or excitation",
         "longer": "" if decay.pushed else ". To keep a longer part, state an earlier start.",
     }

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from functools import partial
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import RK45
 
 # m1 x'' + c x' + F_dry sign(x') + c_q x'|x'| + k1 x + k_cubic x^3 = 0, capsule at rest, x = x_rel about its
 # equilibrium.
@@ -20,21 +20,11 @@ import numpy as np
 # step giant-step). This needs one matrix product instead of n complex exponentials.
 
 
-#: Runge–Kutta steps per half cycle, and of a decay that may have more half cycles than ``LONG``, each of which changes it
-#: little. Errors relative to the amplitude (tested): x_rel 1e-8, velocity 1e-7 omega, acceleration 5e-6 omega^2; of a long
-#: decay x_rel 2e-6.
+#: Steps of SciPy's Runge–Kutta formula (Dormand and Prince, order 5) per half cycle, and of a decay that may have more
+#: half cycles than ``LONG``, each of which changes it little. Errors relative to the amplitude (tested): x_rel 1e-8,
+#: velocity 1e-7 omega, acceleration 5e-6 omega^2; of a long decay x_rel 2e-6. A formula of higher order would not lower
+#: them: the polynomials between the nodes set them.
 STEPS, FEWER_STEPS, LONG = 24, 8, 100
-#: Butcher's method of order 6 (1964): weights of earlier slopes at each stage, and of all slopes in the step.
-STAGES = (
-    (),
-    (1 / 3,),
-    (0, 2 / 3),
-    (1 / 12, 1 / 3, -1 / 12),
-    (-1 / 16, 9 / 8, -3 / 16, -3 / 8),
-    (0, 9 / 8, -3 / 8, -3 / 4, 1 / 2),
-    (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0, -16 / 11),
-)
-WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
 #: Slows the phase's velocity where quadratic damping takes most of the amplitude in a half cycle, dimensionless.
 STRETCH = 0.35
 #: Newton steps for the rest position of a half cycle. A linear spring needs none.
@@ -49,10 +39,10 @@ class Motion(NamedTuple):
     acceleration: Any
 
 
-def rates(k1: Any, c: Any, m1: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
+def rates(k1: Any, c: Any, m1: Any) -> tuple[Any, Any]:
     """Decay rate gamma, 1/s, and frequency omega, rad/s (NaN where overdamped)."""
     gamma = c / (2.0 * m1)
-    return gamma, xp.sqrt(k1 / m1 - gamma**2)
+    return gamma, jnp.sqrt(k1 / m1 - gamma**2)
 
 
 class HalfCycles(NamedTuple):
@@ -62,14 +52,12 @@ class HalfCycles(NamedTuple):
 
     Attributes
     ----------
-    times, amplitudes : (half_cycles,) s and m, of the turning points; the rod sticks at an amplitude of at most ``rest``
-    rest : () m, where the spring balances dry friction
+    times, amplitudes : (half_cycles,) s and m, of the turning points
     node_times, positions, velocities, accelerations : (half_cycles, steps + 1), both ends of the half cycle included
     """
 
     times: Any
     amplitudes: Any
-    rest: Any
     node_times: Any
     positions: Any
     velocities: Any
@@ -117,16 +105,16 @@ def half_cycles(
     def step(state: tuple[Any, Any, Any], at: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any]]:
         r, t, stretch = state
         slopes: list[tuple[Any, Any]] = []
-        for weights, cosine, sine in zip(STAGES, *at, strict=True):
-            moved = r + width * sum(w * own for w, (own, _) in zip(weights, slopes, strict=True) if w)
+        for weights, cosine, sine in zip(RK45.A, *at, strict=True):
+            moved = r + width * sum(w * own for w, (own, _) in zip(weights, slopes, strict=False) if w)
             slopes.append(slope(moved, cosine, sine, stretch))
         r, t = (
-            z + width * sum(w * own for w, own in zip(WEIGHTS, each, strict=True))
+            z + width * sum(w * own for w, own in zip(RK45.B, each, strict=True))
             for z, each in zip((r, t), zip(*slopes, strict=True), strict=True)
         )
         return (r, t, stretch), (r, t)
 
-    stages = width * (np.arange(steps)[:, None] + np.array([sum(weights) for weights in STAGES]))
+    stages = width * (np.arange(steps)[:, None] + RK45.C)
     trigonometry = jnp.asarray(np.cos(stages)), jnp.asarray(np.sin(stages))
 
     def half(state: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], tuple[Any, ...]]:
@@ -147,7 +135,7 @@ def half_cycles(
     x = jnp.where(r > 0.0, rest + r * np.cos(nodes), amplitudes[:, None])
     y = -stretch[:, None] * omega * r * np.sin(nodes)
     pull = k1 * x + k_cubic * x**3 - F_dry + c * y - c_q * y**2
-    return HalfCycles(times, amplitudes, rest, t, x, y, jnp.where(r > 0.0, -pull / m1, 0.0))
+    return HalfCycles(times, amplitudes, t, x, y, jnp.where(r > 0.0, -pull / m1, 0.0))
 
 
 @partial(jax.jit, static_argnames="number")
@@ -174,7 +162,7 @@ def interpolate(path: HalfCycles, time: Any) -> Motion:
     steps = path.node_times.shape[1] - 1
     node = jnp.clip(jnp.searchsorted(path.node_times[:, :-1].ravel(), time, side="right") - 1, 0, number * steps - 1)
     half, left = node // steps, node % steps
-    t, t_next, x, x_next, y, y_next, a, a_next = (values[half, at] for values in path[3:] for at in (left, left + 1))
+    t, t_next, x, x_next, y, y_next, a, a_next = (values[half, at] for values in path[2:] for at in (left, left + 1))
     h = t_next - t
     s = (time - t) / h
     y, y_next, a, a_next = h * y, h * y_next, h**2 * a, h**2 * a_next

@@ -39,7 +39,6 @@ from capsule_id.experiments.free_vibration.decrement import (
     damping_of_peaks,
     equilibrium,
     logarithmic_decrement,
-    trend,
     viscous_basis,
     viscous_fit,
 )
@@ -72,9 +71,10 @@ from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.release import shortened
 from capsule_id.records.tones import noise_level
+from capsule_id.records.view import FILTER_ORDER
 from capsule_id.rig.filters import choose_window, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Curve, Facts, Points
+from capsule_id.views import Comparison, Curve, Points
 
 # noise: Coloured noise and drift of a record, at any sampling, whitened in linear time.
 #
@@ -173,8 +173,6 @@ def averaged_process(times: ReadingTimes, correlation_time: Any) -> SymmQSM:
 
 #: Twice the damping ratio up to which an even record is summed in closed form.
 UNIFORM = 0.6
-#: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
-SMOOTHING_ORDER = 3
 #: Latest first turning point after the first sample, in half periods.
 LATEST_TURNING_POINT = 0.1
 #: A rough viscous fit whose residuals are this many times the noise misses a force.
@@ -292,7 +290,7 @@ class Decay(SurfaceExperiment):
         """Keys of the model that the entry states; a second fit leaves them as they are."""
         return tuple(word for word in CHOICES if getattr(self.table.settings, word) is not None)
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         def curve(values: ValuesBySymbol) -> np.ndarray:
             raw, design = self.unwhitened(values, np)
             return (self.observed - raw + design @ self.nuisance_mean(values))[: len(self.time)]
@@ -300,18 +298,18 @@ class Decay(SurfaceExperiment):
         unit, time = self.column.to_display, self.time + float(decay_window(self.table)[0][0])
         lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)
         residuals = np.asarray(self.residuals(theta, np))[: len(time)]
-        return Comparison(
-            self.kind,
-            self.label,
-            f"{self.label}: {self.title}",
-            "time [s]",
-            axis_label(self.column),
-            (Points(self.label, time, self.values * unit),),
-            (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
-            time,
-            residuals,
-            autocorrelation(residuals, min(60, self.n // 4)) if self.time_series else None,
-            1.96 / float(np.sqrt(self.n)) if self.time_series else None,
+        return (
+            Comparison(
+                self.kind,
+                self.label,
+                f"{self.label}: {self.title}",
+                "time [s]",
+                axis_label(self.column),
+                (Points(self.label, time, self.values * unit),),
+                (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
+                residuals,
+                autocorrelation(residuals) if self.time_series else None,
+            ),
         )
 
 
@@ -495,8 +493,8 @@ class DecayRecord(Decay):
         time, values = self.condensed
         if not is_even(time):
             return values
-        window = self.table.settings.smoothing_window or choose_window(time, values, SMOOTHING_ORDER)
-        return savitzky_golay(time, values, window, SMOOTHING_ORDER)
+        window = self.table.settings.smoothing_window or choose_window(time, values, FILTER_ORDER)
+        return savitzky_golay(time, values, window, FILTER_ORDER)
 
     def decrement(self, smooth: bool = True) -> Decrement | None:
         """Return peaks and logarithmic decrement, from the smoothed or the raw record; None with too few peaks."""
@@ -545,9 +543,3 @@ class DecayRecord(Decay):
     @property
     def cycles(self) -> np.ndarray:
         return self.time * self.rough.Omega_o / (2.0 * np.pi)
-
-    def damping_trend(self) -> Facts:
-        """Drift of damping and frequency of the peaks with amplitude, see ``trend``; empty without drift."""
-        decrement = self.decrement()
-        facts = {} if decrement is None else trend(decrement, noise_level(self.values))
-        return facts and {**facts, "amplitude": tuple(self.deflection * size for size in facts["amplitude"])}

@@ -12,10 +12,11 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.experiments.base import LEVEL, Start, ljung_box, refit
-from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, equilibrium, viscous_fit
-from capsule_id.experiments.free_vibration.hidden_terms import force_responses, further_columns
+from capsule_id.experiments.base import LEVEL, Start, further_columns, ljung_box, refit
+from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, viscous_fit
+from capsule_id.experiments.free_vibration.hidden_terms import SENSITIVITY_STEP, force_responses, sensitivities
 from capsule_id.experiments.free_vibration.models import (
+    STEPS,
     HalfCycles,
     half_cycles,
     interpolate,
@@ -25,7 +26,9 @@ from capsule_id.experiments.free_vibration.models import (
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FEWEST_PER_PERIOD,
+    LONGEST_WHOLE,
     MOST_PERIODS,
+    READINGS_PER_PERIOD,
     DecayModel,
     block_mean,
     block_means,
@@ -115,23 +118,11 @@ def nested_starts(e: DecayRecord) -> list[dict[str, float]]:
     ]
 
 
-def starts_of_motion(e: DecayRecord, rough: Decrement) -> dict[str, Start]:
-    """Starts of x_rel and its rate at the first sample."""
-    size = abs(float(rough.peaks[0]))
-    rate = np.polyfit(e.time[:5], e.values[:5], 1)[0]
-    return {
-        f"x_start[{e.label}]": Start(float(e.values[0] - equilibrium(e.values)), 0.02 * size),
-        f"y_start[{e.label}]": Start(float(rate), 0.05 * rough.Omega_o * size),
-    }
-
-
 # fits: Maximum-likelihood fits of single decays, with the noise level in closed form, for the ranking of models.
 
 
-#: Largest number of evaluations in a fit, and relative step of its difference quotients.
-EVALUATIONS, STEP = 40, 1e-5
-#: Most Runge–Kutta steps of a half cycle: x_rel is wrong by up to 5e-6 of the amplitude, which decides no ranking.
-STEPS = 12
+#: Largest number of evaluations in a fit.
+EVALUATIONS = 40
 #: Distance of starts from the bounds, and of the start of a term that a nested model lacks.
 INSIDE, ABSENT_TERM = 1e-3, 1e-9
 #: Replaces the effect of an unknown that the record does not depend on.
@@ -176,7 +167,8 @@ def free_symbols(model: DecayModel) -> list[str]:
 @lru_cache(maxsize=32)
 def _paths(number: int) -> Callable[[Mapping[str, Any]], tuple[HalfCycles, Any]]:
     """Program for half cycles of a batch of parameters; it also returns a number without meaning."""
-    path = jax.vmap(partial(half_cycles, number=number, steps=min(STEPS, steps_of(number))))
+    # With half of the steps x_rel is wrong by up to 5e-6 of the amplitude, which decides no ranking.
+    path = jax.vmap(partial(half_cycles, number=number, steps=min(STEPS // 2, steps_of(number))))
     forces = ("k1", "c", "m1", "F_dry", "c_q", "k_cubic")
     return as_one_function(
         lambda theta: path({name: theta[name] for name in forces}, theta["amplitude"], theta["turning_time"])
@@ -216,28 +208,23 @@ class Screening:
     """
 
     def __init__(self, record: DecayRecord, thin: int | None = None, k1: float | None = None) -> None:
-        rough = record.rough
+        self.record, self.c, self.omega = record, record.rough.c, record.rough.Omega_o
         self.turning_time, peak = record.first_turning_point()
-        self.side, self.size = float(np.sign(peak)), abs(peak)
-        self.m1, self.k1, self.c, self.omega = record.mass, k1 or rough.k1, rough.c, rough.Omega_o
-        self.period = 2.0 * np.pi / self.omega
-        self.order = record.order
-        blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
-        self.values, self.nodes, self.weights = blocks.values, blocks.nodes, blocks.weights
-        self.times = ReadingTimes.of(blocks)
+        self.side, self.period = float(np.sign(peak)), 2.0 * np.pi / self.omega
+        self.blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
+        self.values, self.times = self.blocks.values, ReadingTimes.of(self.blocks)
         self.number = most_half_cycles(float(record.time[-1]), self.omega)
-        self.units = natural_units(self.k1, self.m1, self.size) | {
-            "k1": self.k1,
+        k1 = k1 or record.rough.k1
+        self.units = natural_units(k1, record.mass, abs(peak)) | {
+            "k1": k1,
             "c": self.c,
-            "amplitude": self.size,
+            "amplitude": abs(peak),
             "turning_time": 1.0 / self.omega,
             "noise_time": 0.1 * self.period,
             "white_ratio": 1.0,
             "drift_ratio": 1.0,
             "drift_time": self.period,
         }
-        self.rough_damping = record.rough_damping
-        self.mean_peak = record.deflection * float(np.mean(np.abs(rough.peaks)))
 
     def theta(self, z: np.ndarray) -> dict[str, Any]:
         """Values by symbol, SI, of scaled unknowns (..., names)."""
@@ -246,7 +233,7 @@ class Screening:
         values["turning_time"] = self.turning_time + values["turning_time"]
         for name in ("white_ratio", "drift_ratio"):
             values[name] = np.where(own[name] < BOUNDS[name][0], 0.0, values[name])
-        return {"m1": np.broadcast_to(self.m1, values["k1"].shape), **values}
+        return {"m1": np.broadcast_to(self.record.mass, values["k1"].shape), **values}
 
     def scaled(self, values: Mapping[str, float]) -> np.ndarray:
         """(names,) scaled unknowns at values by symbol, SI, of another fit; amplitude and time of this record's own."""
@@ -255,7 +242,7 @@ class Screening:
 
     def start(self, model: DecayModel, near: np.ndarray | None, absent: bool = False) -> np.ndarray:
         """(names,) scaled starting values; terms that the model lacks are switched off, ``absent`` those ``near`` lacks too."""
-        z = self.scaled(self.rough_damping(model.symbols)) if near is None else near.copy()
+        z = self.scaled(self.record.rough_damping(model.symbols)) if near is None else near.copy()
         free = free_symbols(model)
         for name, value in (("F_dry", 0.02), ("c_q", 0.05), ("k_cubic", 0.0), ("drift_time", 1.0)):
             i = NAMES.index(name)
@@ -279,11 +266,12 @@ class Screening:
         """
         i, j = NAMES.index("F_dry"), NAMES.index("c")
         found = self.theta(start)
-        known = "F_dry" in self.rough_damping(("F_dry",))
+        known = "F_dry" in self.record.rough_damping(("F_dry",))
         size, low, high = (found["F_dry"], 0.5, 2.0) if known else (self.units["F_dry"], 0.003, 0.45)
         grid = size * np.geomspace(low, high, len(NAMES) + 1)
         lost = (found["F_dry"] if known else 0.0) - grid
-        c = np.maximum(found["c"] + lost * 4.0 / (np.pi * self.omega * self.mean_peak), 0.02 * self.c)
+        peak = self.record.deflection * float(np.mean(np.abs(self.record.rough.peaks)))
+        c = np.maximum(found["c"] + lost * 4.0 / (np.pi * self.omega * peak), 0.02 * self.c)
         starts = np.tile(start, (len(grid), 1))
         starts[:, i], starts[:, j] = grid / self.units["F_dry"], np.log(c / self.c)
         moved = np.repeat(starts[None], DRY_ROUNDS, axis=0)
@@ -316,12 +304,12 @@ class Screening:
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
             stop_if_interrupted()
-            sign = np.where(z > high - 2.0 * STEP, -1.0, 1.0)
+            sign = np.where(z > high - 2.0 * SENSITIVITY_STEP, -1.0, 1.0)
             whole = np.tile(start, (len(NAMES) + 1, 1))
-            whole[: len(free) + 1, free] = np.concatenate([z[None], z + STEP * np.diag(sign)])
+            whole[: len(free) + 1, free] = np.concatenate([z[None], z + SENSITIVITY_STEP * np.diag(sign)])
             points = whitened(whole)[: len(free) + 1]
             points = np.where(np.isfinite(points), points, UNFIT)
-            jacobians[z.tobytes()] = (points[1:] - points[:1]).T / (STEP * sign)
+            jacobians[z.tobytes()] = (points[1:] - points[:1]).T / (SENSITIVITY_STEP * sign)
             return points[0]
 
         low, high = np.array([BOUNDS[NAMES[i]] for i in free]).T
@@ -351,7 +339,7 @@ class Screening:
         _, first, place = np.unique(whole[:, : ROWS - 1], axis=0, return_index=True, return_inverse=True)
         parts = np.resize(first, (-(-len(first) // ROWS), ROWS))
         paths = (_paths(self.number)({name: x[part] for name, x in thetas.items()})[0] for part in parts)
-        readings = [_readings(path, self.nodes, self.weights, self.order) for path in paths]
+        readings = [_readings(path, self.blocks.nodes, self.blocks.weights, self.record.order) for path in paths]
         return thetas, self.side * np.concatenate(readings)[np.ravel(place)]
 
     def drowned(self, z: np.ndarray) -> bool:
@@ -401,15 +389,10 @@ class Screening:
 # then fitted to the record by maximum likelihood and ranked by BIC.
 
 
-#: Records are thinned to this many readings per period before their models are ranked.
-READINGS_PER_PERIOD = 16
-#: Fewest readings of a thinned record.
-FEWEST_READINGS = 80
-#: Largest number of samples of a record that is no free decay.
-LONGEST_UNCUT = 1000
 #: Of forces whose BIC differs by less, the fewest are chosen: with seven alternatives, noise alone often gains this much.
 BIC_MARGIN = 4.0
-#: Shorter records, in samples, keep their model.
+#: Shorter records, in samples, keep their model, and shorter halves of a record are not fitted. A thinned record has twice
+#: as many readings.
 SHORTEST = 40
 #: Residuals with a larger p-value of the Ljung–Box test count as white here; the check after the fit is more lenient.
 WHITENESS = 0.01
@@ -455,24 +438,20 @@ def demands_another(record: DecayRecord, level: float) -> bool:
 
 def response_p(record: DecayRecord, theta: Mapping[str, float]) -> float:
     """p-value of the F test for the responses of the rod to further forces and for a drift, at a viscous fit."""
-    raw, design = record.unwhitened(theta, np)
-    parts = np.linalg.lstsq(design, raw, rcond=None)[0]
-    columns = force_responses(record, theta).values()
+    left, design, moved = sensitivities(record, theta, ("k1", "c"))
     relative = record.time / record.time[-1] - 0.5
-    extra = np.column_stack([*columns, relative, relative**2])
-    moved = [record.unwhitened({**theta, name: 1.001 * theta[name]}, np)[1] @ parts for name in ("k1", "c")]
-    known = np.column_stack([design, *(column - design @ parts for column in moved)])
+    extra = np.column_stack([*force_responses(record, theta).values(), relative, relative**2])
     # A column of zeros is no effect: quadratic damping of a record that stays where it is.
     extra = extra / np.maximum(np.linalg.norm(extra, axis=0), np.finfo(float).tiny)
-    p, _ = further_columns(known, extra, raw)
-    return 1.0 if p is None else p
+    p = further_columns(np.column_stack([design, *moved.values()]), extra, left)[1]
+    return 1.0 if np.isnan(p) else p
 
 
 def thinning(record: DecayRecord, per_period: float) -> int:
     """Return the block size that leaves about ``per_period`` readings, and not too few; no less than that of the record."""
     time = record.whole[0]
     step = 2.0 * np.pi / (record.rough.Omega_o * per_period * median_step(time))
-    return max(record.model.thin, min(int(step), len(time) // FEWEST_READINGS))
+    return max(record.model.thin, min(int(step), len(time) // (2 * SHORTEST)))
 
 
 @dataclass(frozen=True)
@@ -529,7 +508,7 @@ def demanded_model(records: Sequence[DecayRecord]) -> Ranking:
     noise. The fits of fewer forces become starts of the quoted fit.
     """
     forces, others = open_models(records[0])
-    coarse = min(thinning(record, READINGS_PER_PERIOD) for record in records)
+    coarse = min(thinning(record, 0.5 * READINGS_PER_PERIOD) for record in records)
     thinned = [Screening(record, coarse) for record in records]
     by_forces = rank(thinned, [replace(model, noise=others[-1].noise) for model in forces])
     best = simplest(by_forces)
@@ -646,7 +625,7 @@ def second_models(
     for i, record in enumerate(records):
         settings = record.table.settings
         if record.label in no_decay and None in settings.choices:
-            thin = settings.thin or max(1, len(record.whole[0]) // LONGEST_UNCUT)
+            thin = settings.thin or max(1, 2 * len(record.whole[0]) // LONGEST_WHOLE)
             kept[i] = record.with_model(replace(record.model, thin=thin))
             findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "thin": thin}, record.label))
     judged = (i for i, record in enumerate(records) if record.label not in no_decay)

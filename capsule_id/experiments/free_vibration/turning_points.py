@@ -16,6 +16,7 @@ from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_S
 from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.experiment import DISAGREE, FAIL, each, halves
 from capsule_id.experiments.free_vibration.hidden_terms import (
+    FEWEST_HALF_SWINGS,
     check_hidden_terms,
     further_sensitivities,
     open_forces,
@@ -37,8 +38,6 @@ from capsule_id.views import Facts, Finding, Level
 #     -> Student's t of that force, or of the differences between the halves
 
 
-#: Fewest turning points that are judged.
-FEWEST_TURNS = 8
 #: Passes that estimate the noise levels.
 PASSES = 4
 #: Largest number of Gauss-Newton steps, of their bisections, and change, in sds, below which a fit has converged.
@@ -61,7 +60,7 @@ def further_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset
     columns, left, symbols = linear(e, theta)
     if offset and not e.both_sides:
         columns = np.column_stack([columns, np.repeat([1.0, 0.0], len(e.values))])
-    if len(e.values) < FEWEST_TURNS or len(e.values) <= columns.shape[1] + 1:
+    if len(e.values) < FEWEST_HALF_SWINGS or len(e.values) <= columns.shape[1] + 1:
         return None
     _, own, _ = least_squares(columns, -left, len(e.values))
     both = np.column_stack([columns, further_sensitivities(e, theta)[symbol]])
@@ -126,7 +125,7 @@ def changes_of_second_half(e: "TurningPoints", theta: ValuesBySymbol) -> dict[st
     """
     n = len(e.values)
     one, left, symbols = linear(e, theta)
-    if n < FEWEST_TURNS or n <= one.shape[1]:
+    if n < FEWEST_HALF_SWINGS or n <= one.shape[1]:
         return {}
     second = np.tile(np.arange(n) >= n // 2, 2)[:, None]
     found, sd, freedom = least_squares(np.concatenate([one, one * second], axis=1), -left, n)
@@ -366,8 +365,8 @@ class TurningPoints(Decay):
             Misfit(times, self.time_reading_sd**2, 1.0, self.time_width * one),
         )
 
-    def paper_decrement(self, smooth: bool = True) -> Decrement:
-        """Observed frequency and logarithmic decrement of the turning points; ``smooth`` has no effect."""
+    def paper_decrement(self) -> Decrement:
+        """Observed frequency and logarithmic decrement of the turning points."""
         peaks = self.values - (0.5 * (self.values[-1] + self.values[-2]) if self.both_sides else 0.0)
         return Decrement.of(self.index, self.time, peaks, self.mass, smallest=0.05)
 

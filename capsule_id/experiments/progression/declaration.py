@@ -100,7 +100,7 @@ def _amplitudes(settings: ProgressionSettings, columns: Mapping[str, Column]) ->
 
 def _crowded(settings: ProgressionSettings, columns: Mapping[str, Column]) -> str:
     """The largest number of trials that share a setting, where any of them may be outlying and there are too many."""
-    most = int(np.max(np.unique(_settings(columns, "periods"), return_counts=True)[1]))
+    most = int(np.max(np.unique(settings_of(columns, settings)[0], axis=0, return_counts=True)[1]))
     return f"{most} trials" if settings.tails == "heavy" and most > MOST_TRIALS else ""
 
 
@@ -142,16 +142,10 @@ def _check_periods(entry: Entry[ProgressionSettings]) -> None:
         raise entry.file.error(row, "periods", "periods must be a whole number", value, "count whole periods")
 
 
-def _settings(columns: Mapping[str, Column], *more: str) -> np.ndarray:
-    """Index of the setting of the drive of every row, where columns ``more`` count too."""
-    drive = [name for name in ("period", "f", "duty", "P_on", "P_d", "current", *more) if name in columns]
-    return np.unique(np.stack([columns[name].values for name in drive], axis=1), axis=0, return_inverse=True)[1]
-
-
 def _lint_settings(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where a table has few settings, or more sessions with several settings than there are parameters for."""
-    del rig
-    setting = _settings(table.columns)
+    drives = np.delete(settings_of(table.columns, table.settings)[0], 1, axis=1)
+    setting = np.unique(drives, axis=0, return_inverse=True)[1]
     settings = 1 + int(np.max(setting))
     if settings < FEWEST_SETTINGS:
         facts = {"settings": settings, "wanted": FEWEST_SETTINGS}
@@ -251,20 +245,21 @@ KIND = Kind(
 # trials: Settings and sessions of the rows of a progression.
 
 
-def settings_of(columns: Mapping[str, Any], settings: ProgressionSettings) -> tuple[np.ndarray, str]:
+def settings_of(columns: Mapping[str, Column], settings: ProgressionSettings) -> tuple[np.ndarray, str]:
     """(n, 4) period, s, number of periods, duty and amplitude of every row; where the amplitude comes from.
 
-    ``columns`` hold values (n,) SI by name. The amplitude is from a "column" (N) or a "current" (A), or a parameter with
+    The amplitude is from a "column" (N) or a "current" (A), or a parameter with
     a "prior", or "exact"; it is 1 in the last two cases.
     """
-    period = columns["period"] if "period" in columns else 1.0 / columns["f"]
+    values = {name: column.values for name, column in columns.items()}
+    period = values["period"] if "period" in values else 1.0 / values["f"]
     one = np.ones(len(period))
     own = AMPLITUDE[settings.drive]
     source = next((name for name in (own, "current") if name in columns), None)
     stated = getattr(settings, own)
     kind = {own: "column", "current": "current"}.get(source or "", "prior" if stated and stated.sd > 0.0 else "exact")
-    parts = (period, columns["periods"], columns.get("duty", one))
-    return np.stack([*parts, one if source is None else columns[source]], axis=1), kind
+    amplitude = one if source is None else values[source]
+    return np.stack([period, values["periods"], values.get("duty", one), amplitude], axis=1), kind
 
 
 def sessions_of(table: Table, rows: np.ndarray) -> np.ndarray:

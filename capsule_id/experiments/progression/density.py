@@ -31,7 +31,7 @@ from capsule_id.physics.batches import array_module, pool
 FAR = 1e3
 #: z of the runs of a session that is integrated out. One that has its setting for itself has the inner ones only. The
 #: outer lines go on beyond their runs.
-NODES = np.array([-2.5, -1.25, 0.0, 1.25, 2.5])
+NODES = 1.25 * np.arange(-2.0, 3.0)
 INNER, MIDDLE = slice(1, 4), 2
 
 

@@ -175,9 +175,7 @@ class Progression(CapsuleForward):
         self.set_model(table, rig, friction)
         self.emulator, self.drive = None, table.settings.drive
         self.reading_variance = table.columns["distance"].reading_sd ** 2
-        rows, self.amplitude_from = settings_of(
-            {name: column.values for name, column in table.columns.items()}, table.settings
-        )
+        rows, self.amplitude_from = settings_of(table.columns, table.settings)
         settings, index = np.unique(rows, axis=0, return_inverse=True)
         setting, session = np.eye(len(settings))[index], sessions_of(table, rows)
         self.heavy = table.settings.tails == "heavy"
@@ -372,7 +370,7 @@ class Progression(CapsuleForward):
 
     def settings_of(self, columns: Mapping[str, Column]) -> tuple[np.ndarray, np.ndarray]:
         """Settings in the rows of a table, (rows, 4), and the durations of their trials, (rows,) s."""
-        rows, _ = settings_of({name: column.values for name, column in columns.items()}, self.table.settings)
+        rows, _ = settings_of(columns, self.table.settings)
         return rows, rows[:, 0] * rows[:, 1]
 
     def setting_names(self) -> list[str]:
@@ -431,7 +429,6 @@ class Progression(CapsuleForward):
                     "mean velocity [mm/s]",
                     (trials,) if len(rows) else (),
                     (Curve(label, 1e3 * settings[own, 0], centre[own], lower, upper),),
-                    None if residuals is None else period[rows],
                     None if residuals is None else residuals[rows],
                 )
             )
@@ -457,9 +454,6 @@ class Progression(CapsuleForward):
     def motions_without(self, motions: np.ndarray, setting: int) -> np.ndarray:
         """Those of ``motions_of_draws`` that the experiment without one setting has."""
         return motions[:, np.asarray(self.sessions.setting_of_run) != setting]
-
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        return self.comparisons(theta, draws)[0]
 
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         """One panel per duty and amplitude: trials, the point fit, and the band of a new trial in a new session."""

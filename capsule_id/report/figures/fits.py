@@ -4,7 +4,6 @@ A panel is ``(data, ax)`` and draws into ``ax``; labels are plain text.
 """
 
 from collections.abc import Sequence
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from scipy import ndimage
 
 from capsule_id.experiments.context import RunRecord
 from capsule_id.inference.result import PointFit
+from capsule_id.parameters import QUANTILE_975
 from capsule_id.records.view import MotionView
 from capsule_id.report.columns import SampledParameters, plain_symbol
 from capsule_id.report.figures.style import (
@@ -25,6 +25,7 @@ from capsule_id.report.figures.style import (
     CYCLE,
     GREEN,
     GREY,
+    MM,
     ORANGE,
     PALE_BLUE,
     PURPLE,
@@ -32,8 +33,6 @@ from capsule_id.report.figures.style import (
     SMALL,
     TEXT,
     VERMILION,
-    figure_of,
-    new_axes,
     new_figure,
     set_legend,
     set_margins,
@@ -45,9 +44,8 @@ from capsule_id.views import Comparison, Curve, Finding, Points
 # comparisons: Measured beside predicted: the panels of a ``Comparison``, and where the point fit's starts ended.
 
 
-# Beyond this many points a record is a cloud of dots, not single readings with bars.
+# Beyond this many points a record is a cloud of dots or a line, not single readings with bars or markers.
 _MANY = 100
-TWO_SIDED_95 = 1.96
 
 _POINT_STYLES: dict[str, dict[str, Any]] = {
     "static": {"marker": "o", "mfc": "none", "color": BLACK},
@@ -58,7 +56,6 @@ _POINT_STYLES: dict[str, dict[str, Any]] = {
 _CURVE_STYLES: dict[str, dict[str, Any]] = {
     "ours": {"color": BLUE, "ls": "-", "lw": 1.8},
     "paper": {"color": VERMILION, "ls": "--", "lw": 1.6},
-    "predictive": {"color": GREEN, "ls": "-.", "lw": 1.6},
     "alternative": {"color": PURPLE, "ls": ":", "lw": 2.0},
 }
 
@@ -84,11 +81,11 @@ def residuals(item: Comparison, ax: Axes) -> None:
     ValueError
         If the comparison has no residuals.
     """
-    if item.residuals is None or item.residual_x is None:
+    if item.residuals is None:
         raise ValueError(f"{item.label} has no residuals")
     many = item.residuals.size > _MANY
-    _about_zero(ax, TWO_SIDED_95, 1.1 * max(3.0, _largest(item.residuals)))
-    ax.plot(item.residual_x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
+    _about_zero(ax, QUANTILE_975, 1.1 * max(3.0, _largest(item.residuals)))
+    ax.plot(item.points[0].x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
     set_text(ax, item.x_label, "residual / sd [1]")
 
 
@@ -100,11 +97,11 @@ def autocorrelation(item: Comparison, ax: Axes) -> None:
     ValueError
         If the comparison has no autocorrelation.
     """
-    if item.autocorrelation is None:
+    if item.autocorrelation is None or item.residuals is None:
         raise ValueError(f"{item.label} has no autocorrelation")
-    bound = item.autocorrelation_bound or 0.0
+    bound = QUANTILE_975 / float(np.sqrt(item.residuals.size))
     limit = 1.25 * max(_largest(item.autocorrelation), 2.0 * bound, 0.05)
-    _about_zero(ax, bound, limit, "95 % of white records" if bound else None)
+    _about_zero(ax, bound, limit, "95 % of white records")
     ax.vlines(np.arange(1, item.autocorrelation.size + 1), 0.0, item.autocorrelation, color=BLACK, lw=1.3)
     set_text(ax, "lag [samples]", "autocorrelation [1]")
     set_legend(ax, "above")  # bars of a coloured record reach everywhere
@@ -122,23 +119,14 @@ def _largest(values: np.ndarray) -> float:
 
 
 def comparison_figure(item: Comparison) -> Figure:
-    """The panel of a comparison with the residual and autocorrelation panels that it has."""
-    if item.residuals is None:
-        comparison(item, ax := new_axes(height=5.6))
-        return figure_of(ax)
-    if item.autocorrelation is None:
-        figure = new_figure(6.4, 5.6)
-        top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (2.4, 1.0), "hspace": 0.12})
-    else:
-        figure = new_figure(9.0, 5.6)
-        grid = figure.add_gridspec(2, 2, height_ratios=(1.7, 1.0), hspace=0.38, wspace=0.25)
-        top, bottom = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
-        autocorrelation(item, figure.add_subplot(grid[1, 1]))
+    """The panel of a comparison over the residual and autocorrelation panels that it has."""
+    below = [residuals] * (item.residuals is not None) + [autocorrelation] * (item.autocorrelation is not None)
+    figure = new_figure(9.0 if item.autocorrelation is not None else 6.4, 5.6)
+    grid = figure.add_gridspec(2, max(len(below), 1), height_ratios=(1.7, 1.0), hspace=0.38, wspace=0.25)
+    top = figure.add_subplot(grid[0, :] if below else grid[:, :])
     comparison(item, top)
-    residuals(item, bottom)
-    if item.autocorrelation is None:
-        top.label_outer()
-        figure.align_ylabels([top, bottom])
+    for column, panel in enumerate(below):
+        panel(item, figure.add_subplot(grid[1, column], sharex=top if panel is residuals else None))
     return figure
 
 
@@ -147,11 +135,8 @@ def side_by_side(items: Sequence[Comparison]) -> Figure:
     columns = min(len(items), 2)
     rows = -(-len(items) // columns)
     figure = new_figure(6.4 * columns, 4.4 * rows, wspace=0.2, hspace=0.3)
-    for ax, item in zip_longest(figure.subplots(rows, columns, squeeze=False).flat, items):
-        if item is None:
-            ax.set_axis_off()
-        else:
-            comparison(item, ax)
+    for number, item in enumerate(items, start=1):
+        comparison(item, figure.add_subplot(rows, columns, number))
     return figure
 
 
@@ -217,8 +202,6 @@ def _draw_points(ax: Axes, points: Points) -> None:
 # readings: Figures of the readings of one experiment with what ``capsule-id check`` found in them.
 
 
-#: A record with more samples than this is a line without markers.
-MOST_MARKERS = 200
 #: Marks of rows that findings name: code, words of the legend, marker, colour.
 _MARKS = (
     ("readings.clipped", "clipped", "v", VERMILION),
@@ -257,7 +240,7 @@ def channel_with_findings(table: Table[Any], name: str, findings: Sequence[Findi
     y = _displayed(table, name)
     x = _displayed(table, across) if across else np.arange(1.0, len(y) + 1.0)
     record = "time" in table.columns
-    marker = "" if record and len(y) > MOST_MARKERS else "o"
+    marker = "" if record and len(y) > _MANY else "o"
     ax.plot(x, y, color=BLUE, lw=0.8 if record else 0.0, marker=marker, ms=3.5, label="readings")
     if record:
         _mark_times(table, findings, ax)
@@ -297,11 +280,10 @@ def _displayed(table: Table[Any], name: str) -> np.ndarray:
 # force (4d).
 
 
-_MM = 1e3
 # Channels in the order of the panels: axis label, display per SI, colour.
 _CHANNELS = {
-    "x_capsule": ("X2, mm", _MM, BLACK),
-    "x_rel": ("X1 - X2, mm", _MM, BLUE),
+    "x_capsule": ("X2, mm", MM, BLACK),
+    "x_rel": ("X1 - X2, mm", MM, BLUE),
     "acceleration_rod": ("acceleration\nof the rod, m/s²", 1.0, GREY),
     "current": ("current, A", 1.0, PURPLE),
 }
@@ -311,16 +293,16 @@ def phase_plane(view: MotionView, ax: Axes) -> None:
     """Rate against x_rel, with the impact line and the Poincaré points at the drive's phase."""
     # At the ends of a filtered record the derivative is that of a polynomial's edge, and mostly noise.
     inside = slice(view.samples // 2, len(view.time) - view.samples // 2)
-    ax.plot(_MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
+    ax.plot(MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
     recorded = view.label != ""
     lines = []
     if np.isfinite(view.gap):
         words = "gap as stated" if recorded else "impact line"
-        lines.append(ax.axvline(_MM * view.gap, color=VERMILION, ls="--", lw=1.2, label=words))
+        lines.append(ax.axvline(MM * view.gap, color=VERMILION, ls="--", lw=1.2, label=words))
     if view.gap_seen is not None:
-        lines.append(ax.axvline(_MM * view.gap_seen, color=VERMILION, ls=":", lw=1.6, label="contacts begin"))
+        lines.append(ax.axvline(MM * view.gap_seen, color=VERMILION, ls=":", lw=1.6, label="contacts begin"))
     look: dict[str, Any] = {"marker": "o", "ms": 4.5, "color": GREEN, "zorder": 3, "label": "once a period"}
-    ax.plot(_MM * view.section_x_rel, view.section_rate, ls="none", **look)
+    ax.plot(MM * view.section_x_rel, view.section_rate, ls="none", **look)
     words = ("rate of X1 - X2, m/s", f"motion: {view.label}") if recorded else ("Y1 - Y2, m/s", "")
     set_text(ax, "X1 - X2, mm", *words)
     below_legend = set_legend(ax, "upper right")
@@ -478,13 +460,11 @@ def traces(columns: SampledParameters, figure: Figure | SubFigure) -> None:
     for i, panel in enumerate(axes.flat[:n]):
         for e, ensemble in enumerate(shown[..., i]):
             panel.plot(step, ensemble, color=CYCLE[e % len(CYCLE)], lw=0.6, alpha=0.8)
-        panel.set_ylabel(f"{columns.symbols[i]} [{columns.units[i]}]", fontsize=SMALL, parse_math=False)
-        panel.tick_params(labelsize=SMALL, length=3)
+        lowest = i + 2 >= n  # of its column; over an empty place too
+        words = "step after burn-in [1]" if lowest else "", f"{columns.symbols[i]} [{columns.units[i]}]"
+        set_text(panel, *words, size=SMALL)
+        panel.tick_params(labelbottom=lowest)
         panel.yaxis.set_major_locator(MaxNLocator(3))
         panel.ticklabel_format(axis="y", useOffset=False, style="plain")
-        panel.spines[["top", "right"]].set_visible(False)
         panel.margins(x=0.01)
-        if i + 2 >= n:  # the lowest of its column; over an empty place too
-            panel.tick_params(labelbottom=True)
-            panel.set_xlabel("step after burn-in [1]", fontsize=TEXT)
     figure.align_ylabels()

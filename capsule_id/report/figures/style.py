@@ -4,7 +4,7 @@ import io
 import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from matplotlib import rc_context, rcParamsDefault
@@ -24,7 +24,7 @@ BLUE, VERMILION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#6B6B6B"
 PALE_BLUE = "#BBD6EA"
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 
-DPI = 150
+DPI, MM = 150, 1e3
 _PALETTE, _NEARLY_WHITE = 128, 253
 # Readable at half of the printed size: 11 pt at a width of 6.4 in.
 TEXT, SMALL = 11.0, 9.5
@@ -72,10 +72,7 @@ def new_axes(width: float = 6.4, height: float = 4.4, **margins: float) -> Axes:
 
 def figure_of(ax: Axes) -> Figure:
     """The figure that ``ax`` stands in."""
-    figure = ax.get_figure(root=True)
-    if figure is None:
-        raise ValueError("these axes have been removed from their figure")
-    return figure
+    return cast(Figure, ax.get_figure(root=True))
 
 
 def subfigure_at(ax: Axes) -> SubFigure:
@@ -85,10 +82,10 @@ def subfigure_at(ax: Axes) -> SubFigure:
     return figure.add_subfigure(place or GridSpec(1, 1, figure=figure)[0])
 
 
-def set_text(ax: Axes, x_label: str, y_label: str, title: str = "") -> None:
+def set_text(ax: Axes, x_label: str, y_label: str, title: str = "", *, size: float = TEXT) -> None:
     """Labels and title as plain text: a ``$`` in somebody's file name is no mathematics."""
-    ax.set_xlabel(x_label, fontsize=TEXT, parse_math=False)
-    ax.set_ylabel(y_label, fontsize=TEXT, parse_math=False)
+    ax.set_xlabel(x_label, fontsize=size, parse_math=False)
+    ax.set_ylabel(y_label, fontsize=size, parse_math=False)
     ax.set_title(title, fontsize=TEXT, parse_math=False, loc="left", fontweight="bold")
     ax.tick_params(labelsize=SMALL, direction="out", length=3)
     ax.spines[["top", "right"]].set_visible(False)

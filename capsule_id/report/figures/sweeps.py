@@ -24,6 +24,7 @@ from capsule_id.report.figures.style import (
     BLUE,
     GREEN,
     GREY,
+    MM,
     PALE_BLUE,
     PURPLE,
     SMALL,
@@ -34,7 +35,6 @@ from capsule_id.report.figures.style import (
     set_text,
 )
 
-_MM = 1e3
 # How a motion's label looks on areas, by direction in the order of the legend: shades, dark to light, and hatch. What
 # does not fit goes into "other".
 _LOOKS = {
@@ -143,7 +143,7 @@ def poincare(data: xr.Dataset, ax: Axes) -> None:
     Values at which branches have come to different attractors are marked at the bottom.
     """
     over, x, _ = _swept(data)
-    y = _MM * data["x_rel"].transpose("branch", over, "section").to_numpy()
+    y = MM * data["x_rel"].transpose("branch", over, "section").to_numpy()
     branches = [str(name) for name in data["branch"].to_numpy()]
     if len(branches) <= len(_BRANCH_LOOKS):
         for name, points, look in zip(branches, y, _BRANCH_LOOKS, strict=False):
@@ -160,7 +160,7 @@ def poincare(data: xr.Dataset, ax: Axes) -> None:
         look = {"ls": "none", "marker": "|", "ms": 8, "color": PURPLE, "transform": ax.get_xaxis_transform()}
         ax.plot(several, np.zeros(several.size), label="several attractors", clip_on=False, **look)
     if over != "G" and "G" in data.attrs:
-        ax.axhline(_MM * float(data.attrs["G"]), color=BLACK, ls="--", lw=0.9, label="impact line")
+        ax.axhline(MM * float(data.attrs["G"]), color=BLACK, ls="--", lw=0.9, label="impact line")
     set_text(ax, _axis_label(data, over), "X1 - X2 once a period, mm")
     set_legend(ax, "above", fontsize=SMALL - 0.5, columnspacing=1.1, handletextpad=0.2, handlelength=1.4)
 
@@ -175,13 +175,13 @@ def mean_velocity(data: xr.Dataset, measured: Sequence[MeasuredPoint], ax: Axes)
     for name, (colour, marker, word) in _DIRECTIONS.items():
         chosen = direction == name
         if chosen.any():
-            ax.plot(at[chosen], _MM * velocity[chosen], ls="none", marker=marker, ms=3.0, color=colour, label=word)
+            ax.plot(at[chosen], MM * velocity[chosen], ls="none", marker=marker, ms=3.0, color=colour, label=word)
     for i, value in enumerate(np.unique(at[label == "failed"])):
         ax.axvline(value, color=GREY, lw=0.8, ls=":", label=None if i else "run given up")
     # Measured runs as the paper draws them, in red, each with the label of its own record.
     look: dict[str, Any] = {"ls": "none", "marker": "D", "ms": 6.0, "mfc": "none", "mew": 1.6, "color": _MEASURED}
     for i, run in enumerate(measured):
-        place = run.value / factor, _MM * run.mean_velocity
+        place = run.value / factor, MM * run.mean_velocity
         ax.plot(*place, label=None if i else "measured", **look)
         text = ax.annotate(run.label, place, xytext=(0, 8), textcoords="offset points", ha="center", color=_MEASURED)
         # white about the letters: they stand among the points of the model
@@ -248,8 +248,8 @@ def objective_band(data: xr.Dataset, ax: Axes) -> None:
     """Median and 95 % band of the objective, the value chosen, and the interval of the best value over the draws."""
     over, x, factor = _swept(data)
     objective = str(data.attrs["objective"])
-    low, middle, high = _MM * data[f"{objective}_quantiles"].to_numpy()
-    least, span, most = _MM * data[f"chosen_{objective}_quantiles"].to_numpy()
+    low, middle, high = MM * data[f"{objective}_quantiles"].to_numpy()
+    least, span, most = MM * data[f"chosen_{objective}_quantiles"].to_numpy()
     best = data["best_quantiles"].to_numpy() / factor
     ax.axhline(0.0, color=GREY, lw=0.8)
     ax.fill_between(x, low, high, color=PALE_BLUE, lw=0, label="95 % band")
@@ -289,7 +289,7 @@ def labels(data: xr.Dataset, title: str, ax: Axes) -> None:
 
 def quantity(data: xr.Dataset, name: str, ax: Axes) -> None:
     """``mean_velocity`` or ``efficiency`` in colour: blue forward, orange backward, dark grey where a run failed."""
-    values = _MM * data[name].to_numpy()
+    values = MM * data[name].to_numpy()
     reach = float(np.nanquantile(np.abs(values), _REACH)) or 1.0
     ax.set_facecolor(GREY)
     mesh = _mesh(data, values, _WORDS[name], ax, cmap=_DIVERGING, vmin=-reach, vmax=reach)

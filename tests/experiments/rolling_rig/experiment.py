@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, no_design
+from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.rig.model import Rig, Table
@@ -61,7 +61,7 @@ class RollingResistance(Experiment):
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         predicted = theta["c_rr"] * (theta["m1"] + theta["m2"]) * theta["g"]
-        return (Misfit(self.force - predicted, self.reading_sd**2, 1.0, no_design(self.n, xp)),)
+        return (Misfit(self.force - predicted, self.reading_sd**2, 1.0, xp.zeros((self.n, 0))),)
 
     def starts(self) -> dict[str, Start]:
         weight = (self.rig.mass("m1") + self.rig.mass("m2")) * self.rig.g.value
@@ -70,12 +70,12 @@ class RollingResistance(Experiment):
             "rolling_scatter": Start(float(np.std(self.force)), 0.3),
         }
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         del draws
         speed, force = (self.table.columns[name] for name in ("speed", "force"))
         level = theta["c_rr"] * (theta["m1"] + theta["m2"]) * theta["g"] * force.to_display
         x = self.speed * speed.to_display
-        return Comparison(
+        panel = Comparison(
             self.kind,
             self.label,
             f"{self.label}: rolling resistance",
@@ -84,3 +84,4 @@ class RollingResistance(Experiment):
             (Points(self.label, x, self.force * force.to_display),),
             (Curve("this fit", x, np.full(self.n, level)),),
         )
+        return (panel,)

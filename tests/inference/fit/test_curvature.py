@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.inference.curvature import BATCH, hessian, in_batches, jacobian, require_width
+from capsule_id.inference.curvature import hessian, jacobian, require_width
+from capsule_id.physics.batches import BATCH, in_batches
 from capsule_id.precision import require_float64
 
 require_float64()

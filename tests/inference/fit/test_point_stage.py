@@ -19,7 +19,7 @@ from tests.forced_runs import TRUTH, make
 def chaotic() -> tuple[Table, dict[str, float]]:
     """Two seconds of the chaotic motion of tests/capsule/test_lyapunov.py, and its true parameters."""
     truth = TRUTH | {"m2": 0.3, "c": 0.5, "mu": 0.2}
-    run = make_runs(truth, 0, (RunSetup("stiff", 34.56, 8.0, 0.5e-3),))[0]
+    run = make_runs(truth, 0, (RunSetup("stiff", 34.56, 8.0, 0.5e-3, 2000, 1e-3),))[0]
     columns = [bench.column("time", run.time), *(bench.column(name, y) for name, y in run.channels.items())]
     settings = {"spring": "stiff", "gap": Quantity(run.stated_gap, 2e-5), "Omega": run.truth.Omega}
     return bench.table("forced_run", columns, "wild", **settings), truth

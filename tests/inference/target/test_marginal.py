@@ -14,11 +14,12 @@ import tests.experiments.bench as bench
 from capsule_id.api import read_rig
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.kind import make_experiments
-from capsule_id.inference.curvature import BATCH, hessian
+from capsule_id.inference.curvature import hessian
 from capsule_id.inference.marginal import HEAVY, MarginalPosterior, conditional, density_of, uniform_at
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
+from capsule_id.physics.batches import BATCH
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.stub import log_posterior
