@@ -234,21 +234,28 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     beginning = _beginning(TextFile(content, path)) if text else b""
     blocks: tuple[tuple[int, int], ...] = ()
     layout = Layout(missing=MARKERS)
+
+    def read(layout: Layout) -> tuple[Export, tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]]:
+        """The export, and what ``_readings`` finds in it: a column of readings at least."""
+        export = EXPORTS[suffix](content, path, layout)
+        found = _readings(export)
+        if not found[0]:
+            nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
+            raise next(iter(found[2].values()), InputError(*nothing, path))
+        return export, found
+
     try:
         if text:
             layout = _text_layout(beginning, path.with_suffix("") if suffix.endswith(COMPRESSED) else path)
-        export = EXPORTS[suffix](content, path, layout)
+        export, (columns, singles, unread) = read(layout)
     except InputError:
         blocks = _blocks(TextFile(content, path), layout) if text else ()
         if not blocks:
             raise
+    if blocks:  # what was read before is free by now
         first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
         layout = replace(layout, data_from_line=first, data_to_line=last)
-        export = EXPORTS[suffix](content, path, layout)
-    columns, singles, unread = _readings(export)
-    if not columns:
-        nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
-        raise next(iter(unread.values()), InputError(*nothing, path))
+        export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
     return FoundLayout(export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
