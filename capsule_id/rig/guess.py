@@ -6,7 +6,6 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import chain, groupby, pairwise, product
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -289,15 +288,15 @@ def _runs(blocks: Iterable[bytes], layout: Layout) -> tuple[list[_Run], Cells]:
     After ``_MOST_RUNS`` no more are searched.
     """
 
-    @lru_cache(1 << 16)
-    def kind(line: str) -> Cells | bool:
-        """Its cells; False for no row."""
-        return is_row(line) and _cells_of_row(line, layout)
+    known = dict[str, Cells | bool]()  # False: no row
 
-    lines = chain.from_iterable(lines_of(_DIGITS.sub(b"0", text)) for text in blocks)
-    same = ((kind(line), sum(1 for _ in equal)) for line, equal in groupby(lines))
+    def kinds(lines: Sequence[str]) -> Iterable[Cells | bool]:
+        known.update((line, is_row(line) and _cells_of_row(line, layout)) for line in {*lines} - known.keys())
+        return map(known.__getitem__, lines)
+
     runs, number = list[_Run](), 0
-    for cells, rows in same:
+    for cells, equal in groupby(chain.from_iterable(kinds(lines_of(_DIGITS.sub(b"0", text))) for text in blocks)):
+        rows = len([*equal])
         number += rows
         if cells is False or len(runs) > _MOST_RUNS:
             continue
