@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise, product
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -176,6 +176,8 @@ _MOST_RUNS = 500_000  # of lines with equal cells, in which blocks of readings a
 _DIGITS = re.compile(rb"[0-9]+")
 #: Separator and number of cells of a line whose first cell is a number; None for any other line.
 Cells = tuple[str | None, int] | None
+#: Cells of successive rows, their number, and the lines of the first and the last one, counted from 1.
+Run = tuple[Cells, int, int, int]
 _RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
 _RATE_NAMES = ("fs", "rate", "sampling_rate", "sample_rate", "samplerate")
 
@@ -266,22 +268,13 @@ def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
     () where a single line with numbers interrupts or ends them, which is a damaged row, and where the cells change too often.
     """
     runs, longest = _runs((text for _, text in file.blocks()), layout)
-    after_block = [run for before, run in pairwise(runs) if before.cells == longest]
-    if len(runs) > _MOST_RUNS or any(run.cells is not None and run.rows == 1 for run in after_block):
+    after_block = [run for before, run in pairwise(runs) if before[0] == longest]
+    if len(runs) > _MOST_RUNS or any(cells is not None and rows == 1 for cells, rows, *_ in after_block):
         return ()
-    return tuple((run.first, run.last) for run in runs if longest is not None and run.cells == longest)
+    return tuple((first, last) for cells, _, first, last in runs if longest is not None and cells == longest)
 
 
-class _Run(NamedTuple):
-    """Successive rows with equal cells: their number, and the lines of the first and the last one, counted from 1."""
-
-    cells: Cells
-    rows: int
-    first: int
-    last: int
-
-
-def _runs(blocks: Iterable[bytes], layout: Layout) -> tuple[list[_Run], Cells]:
+def _runs(blocks: Iterable[bytes], layout: Layout) -> tuple[list[Run], Cells]:
     """Runs of lines with equal cells, and the cells of the longest run of two rows or more.
 
     Blank lines and comments are left out. What a line is depends on where its digits stand, not on which ones they are.
@@ -294,16 +287,15 @@ def _runs(blocks: Iterable[bytes], layout: Layout) -> tuple[list[_Run], Cells]:
         known.update((line, is_row(line) and _cells_of_row(line, layout)) for line in {*lines} - known.keys())
         return map(known.__getitem__, lines)
 
-    runs, number = list[_Run](), 0
+    runs, number = list[Run](), 0
     for cells, equal in groupby(chain.from_iterable(kinds(lines_of(_DIGITS.sub(b"0", text))) for text in blocks)):
         rows = len([*equal])
         number += rows
-        if cells is False or len(runs) > _MOST_RUNS:
-            continue
-        last = runs.pop() if runs and runs[-1].cells == cells else _Run(cells, 0, number - rows + 1, 0)
-        runs.append(last._replace(rows=last.rows + rows, last=number))
-    tables = [run for run in runs if run.cells is not None and run.rows > 1]
-    return runs, max(tables, key=lambda run: run.rows).cells if tables else None
+        if cells is not False and len(runs) <= _MOST_RUNS:
+            _, before, first, _ = runs.pop() if runs and runs[-1][0] == cells else (cells, 0, number - rows + 1, 0)
+            runs.append((cells, before + rows, first, number))
+    tables = [run for run in runs if run[0] is not None and run[1] > 1]
+    return runs, max(tables, key=lambda run: run[1])[0] if tables else None
 
 
 def _cells_of_row(line: str, layout: Layout) -> Cells:
@@ -366,7 +358,7 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
                 first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
             if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
                 runs, longest = _runs([beginning], layout) if line is not None else ([], None)
-                if any(run.first < (line or 0) for run in runs if longest is not None and run.cells == longest):
+                if any(run[2] < (line or 0) for run in runs if longest is not None and run[0] == longest):
                     break  # rows like those of the longest block lie above the line
                 return layout
     assert first is not None, "every layout was refused"
