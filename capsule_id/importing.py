@@ -245,10 +245,12 @@ def _first_with_unit(
 
 def are_turning_points(values: np.ndarray) -> bool:
     """Whether the few readings of a table can be the amplitudes of a decay, on one side or on both sides in turn."""
+    if len(values) >= FEWEST_SAMPLES:  # of a long record the next lines take more memory than its readings
+        return False
     sizes, signs = np.abs(values), np.sign(values)
     sides = signs[1:] * signs[:-1]
     falls = bool(np.all(np.diff(sizes) <= 0.0)) and sizes[-1] < sizes[0]
-    return len(values) < FEWEST_SAMPLES and falls and bool(np.all(sides == sides[0])) and sides[0] != 0.0
+    return falls and bool(np.all(sides == sides[0])) and sides[0] != 0.0
 
 
 def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None] | None:

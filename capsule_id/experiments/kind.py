@@ -2,6 +2,7 @@
 
 import os
 import site
+import sys
 import sysconfig
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -215,8 +216,9 @@ def _built_in(name: str) -> Kind:
 def package_folders() -> list[str]:
     """The folders of installed packages: those of the interpreter and of the user, and what their ``.pth`` files name.
 
-    ``sys.path`` does not count: it may hold the working folder, which may be a rig folder that somebody else made. That
-    folder never counts; an editable install of a package in it has its metadata beside the ``.pth`` file.
+    Of ``sys.path`` what stands behind the standard library counts: there ``site.addsitedir`` puts its folders. What stands
+    before it may be the working folder, which may be a rig folder that somebody else made. The working folder and rig
+    folders never count; an editable install of a package in them has its metadata beside the ``.pth`` file.
     """
     user = [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
     own = [*site.getsitepackages(), sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), *user]
@@ -225,8 +227,11 @@ def package_folders() -> list[str]:
         with suppress(OSError):
             lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
             named += [str(file.parent / line.strip()) for line in lines if line.strip()]
-    found = {os.path.realpath(folder): None for folder in (*own, *named) if os.path.isdir(folder)}  # noqa: PTH112
-    return [folder for folder in found if folder != os.path.realpath(os.curdir)]
+    library, path = os.path.realpath(sysconfig.get_path("stdlib")), [*map(os.path.realpath, sys.path)]
+    added = path[path.index(library) :] if library in path else []
+    found = {os.path.realpath(folder): None for folder in (*own, *named, *added) if os.path.isdir(folder)}  # noqa: PTH112
+    rigs = {folder for folder in found if Path(folder, "rig.toml").exists()}
+    return [folder for folder in found if folder not in {*rigs, os.path.realpath(os.curdir)}]
 
 
 @cache

@@ -295,17 +295,25 @@ def _fit(
     return best
 
 
-def _motions(phase: np.ndarray, zeta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Offset and two free motions, their rates, (n, 3) each, the poles (2,) and the waves (n, 2) of a linear decay."""
+def _motions(phase: np.ndarray, zeta: float) -> tuple[np.ndarray, np.ndarray, complex, np.ndarray, np.ndarray]:
+    """Offset and two free motions, their rates, (n, 3) each, the root of zeta^2 - 1, and poles and waves of a linear decay.
+
+    Of two conjugate poles one is given, (1, 1), with its wave (1, n); of two real ones both, (2, 1), with theirs (2, n).
+    """
     root = np.sqrt(complex(zeta**2 - 1.0))
-    root = root if abs(root) > 1e-3 else 1e-3
-    poles = np.array([-zeta + root, -zeta - root])
-    exponents = poles * phase[:, None]
-    waves = np.exp(np.clip(np.real(exponents), -60.0, 60.0) + 1j * np.imag(exponents))
-    first = ((poles[0] * waves[:, 1] - poles[1] * waves[:, 0]) / (poles[0] - poles[1])).real
-    second = ((waves[:, 0] - waves[:, 1]) / (poles[0] - poles[1])).real
-    motions = np.column_stack([np.ones_like(phase), first, second])
-    return motions, np.column_stack([np.zeros_like(phase), -second, first - 2.0 * zeta * second]), poles, waves
+    root = root if abs(root) > 1e-3 else 1e-3 + 0.0j
+    poles = np.array([[-zeta + root]]) if root.real == 0.0 else np.array([[-zeta + root.real], [-zeta - root.real]])
+    waves = np.exp(np.clip(poles.real * phase, -60.0, 60.0))
+    if root.real == 0.0:
+        waves = waves * np.exp(1j * root.imag * phase)
+        second = waves[0].imag / root.imag
+        first = waves[0].real + zeta * second
+    else:
+        second = (waves[0] - waves[1]) / (2.0 * root.real)
+        first = waves[0] - poles[0] * second
+    motions, rates = np.ones((2, 3, len(phase)))
+    motions[1:], rates[:] = (first, second), (0.0 * phase, -second, first - 2.0 * zeta * second)
+    return motions.T, rates.T, root, poles, waves
 
 
 def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> np.ndarray:
@@ -320,28 +328,34 @@ def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> n
     zeta : damping ratio
     values : (n,) readings; ``sd`` of their errors
     """
-    motions, rates, poles, waves = _motions(phase, zeta)
-    half = 0.5 * np.diff(phase)[:, None, None]
+    motions, rates, root, poles, waves = _motions(phase, zeta)
+    half, back, n = 0.5 * np.diff(phase), 1.0 / waves, len(phase)
 
     def response(forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Displacement and rate, (n, k) each, from rest by forces (n, k)."""
-        pulled = forces[:, None, :] / waves[:, :, None]
-        sums = np.concatenate([np.zeros((1, *pulled.shape[1:])), np.cumsum((pulled[1:] + pulled[:-1]) * half, axis=0)])
-        parts = sums * waves[:, :, None] * np.array([1.0, -1.0])[:, None] / (poles[0] - poles[1])
-        return parts.sum(axis=1).real, (parts * poles[:, None]).sum(axis=1).real
+        """Displacement and rate, (k, n) each, from rest by forces (k, n)."""
+        pulled, parts = forces[:, None] * back, np.zeros((len(forces), *waves.shape), waves.dtype)
+        np.cumsum((pulled[..., 1:] + pulled[..., :-1]) * half, axis=2, out=parts[..., 1:])
+        parts *= waves
+        if root.real == 0.0:
+            return parts[:, 0].imag / root.imag, (poles[0] * parts[:, 0]).imag / root.imag
+        return tuple((one[:, 0] - one[:, 1]) / (2.0 * root.real) for one in (parts, poles * parts))
 
+    # The further forces have the prior ``FURTHER``.
+    columns, wanted = np.zeros((6, n + 3)), np.zeros(n + 3)
+    columns[:3, :n], wanted[:n] = motions.T, values
+    columns[[3, 4, 5], [n, n + 1, n + 2]] = sd / FURTHER
     found = np.linalg.lstsq(motions, values, rcond=1e-9)[0]
-    x, v = motions[:, 1:] @ found[1:], rates @ found
+    x, v = found[1:] @ motions.T[1:], found @ rates.T
     size = float(np.max(np.abs(x))) + 1e-300
-    further = rate = np.zeros((len(phase), 3))
     for turn in range(3):
-        a, b = np.clip(x / size, -3.0, 3.0), np.clip(v / size, -3.0, 3.0)
-        further, rate = response(-size * np.column_stack([np.sign(b), b * np.abs(b), a**3]))
+        a, b = np.minimum(np.maximum(np.array([x, v]) / size, -3.0), 3.0)
+        forces = -size * np.array([np.sign(b), b * np.abs(b), a * a * a, 2.0 / size * v][: 3 + turn // 2])
+        further, rate = response(forces)
         if turn < 2:
-            columns = np.vstack([np.hstack([motions, further]), np.hstack([np.zeros((3, 3)), np.diag(sd / FURTHER)])])
-            found = np.linalg.lstsq(columns, np.concatenate([values, np.zeros(3)]), rcond=1e-10)[0]
-            x, v = columns[: len(phase), 1:] @ found[1:], rates @ found[:3] + rate @ found[3:]
-    return np.column_stack([motions, phase * v, response(-2.0 * v[:, None])[0], further])
+            columns[3:, :n] = further
+            found = np.linalg.lstsq(columns.T, wanted, rcond=1e-10)[0]
+            x, v = found[1:] @ columns[1:, :n], found[:3] @ rates.T + found[3:] @ rate
+    return np.concatenate([motions.T, [phase * v], further[3:], further[:3]]).T
 
 
 def _whole(

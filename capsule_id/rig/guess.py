@@ -6,7 +6,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, groupby, islice, pairwise, product
+from itertools import chain, groupby, pairwise, product
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +17,7 @@ from capsule_id.errors import InputError, printable
 from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
 from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
-from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile
+from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile, lines_of
 from capsule_id.rig.formats.text import is_row
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale, symbol_named
@@ -172,9 +172,12 @@ MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null"
 MOST_MISSING = 0.5
 _BEGINNING, _MOST_LINES = 100_000, 3_000  # bytes and lines in which the first row of readings is searched
 _MOST_TITLES = 100  # lines
-_MOST_SEARCHED = 500_000  # lines of a text that are searched for blocks of readings
+_MOST_RUNS = 500_000  # of lines with equal cells, in which blocks of readings are searched
+_DIGITS = re.compile(rb"[0-9]+")
 #: Separator and number of cells of a line whose first cell is a number; None for any other line.
 Cells = tuple[str | None, int] | None
+#: Cells of successive rows, their number, and the lines of the first and the last one, counted from 1.
+Run = tuple[Cells, int, int, int]
 _RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
 _RATE_NAMES = ("fs", "rate", "sampling_rate", "sample_rate", "samplerate")
 
@@ -232,21 +235,28 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     beginning = _beginning(TextFile(content, path)) if text else b""
     blocks: tuple[tuple[int, int], ...] = ()
     layout = Layout(missing=MARKERS)
+
+    def read(layout: Layout) -> tuple[Export, tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]]:
+        """The export, and what ``_readings`` finds in it: a column of readings at least."""
+        export = EXPORTS[suffix](content, path, layout)
+        found = _readings(export)
+        if not found[0]:
+            nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
+            raise next(iter(found[2].values()), InputError(*nothing, path))
+        return export, found
+
     try:
         if text:
             layout = _text_layout(beginning, path.with_suffix("") if suffix.endswith(COMPRESSED) else path)
-        export = EXPORTS[suffix](content, path, layout)
+        export, (columns, singles, unread) = read(layout)
     except InputError:
         blocks = _blocks(TextFile(content, path), layout) if text else ()
         if not blocks:
             raise
+    if blocks:  # what was read before is free by now
         first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
         layout = replace(layout, data_from_line=first, data_to_line=last)
-        export = EXPORTS[suffix](content, path, layout)
-    columns, singles, unread = _readings(export)
-    if not columns:
-        nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
-        raise next(iter(unread.values()), InputError(*nothing, path))
+        export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
     return FoundLayout(export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
@@ -255,28 +265,37 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
 def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
     """First and last lines of the blocks of readings of a text.
 
-    () where a single line with numbers interrupts or ends them, which is a damaged row, and for a very long text.
+    () where a single line with numbers interrupts or ends them, which is a damaged row, and where the cells change too often.
     """
-    lines = [*islice(file.lines(), _MOST_SEARCHED + 1)]
-    if len(lines) > _MOST_SEARCHED:
-        return ()
-    runs, longest = _runs(lines, layout)
+    runs, longest = _runs((text for _, text in file.blocks()), layout)
     after_block = [run for before, run in pairwise(runs) if before[0] == longest]
-    if any(cells is not None and len(numbers) == 1 for cells, numbers in after_block):
+    if len(runs) > _MOST_RUNS or any(cells is not None and rows == 1 for cells, rows, *_ in after_block):
         return ()
-    return tuple((numbers[0], numbers[-1]) for cells, numbers in runs if longest is not None and cells == longest)
+    return tuple((first, last) for cells, _, first, last in runs if longest is not None and cells == longest)
 
 
-def _runs(lines: Iterable[str], layout: Layout) -> tuple[list[tuple[Cells, list[int]]], Cells]:
-    """Runs of lines with equal cells, their numbers counted from 1, and the cells of the longest run of two rows or more.
+def _runs(blocks: Iterable[bytes], layout: Layout) -> tuple[list[Run], Cells]:
+    """Runs of lines with equal cells, and the cells of the longest run of two rows or more.
 
-    Blank lines and comments are left out.
+    Blank lines and comments are left out. What a line is depends on where its digits stand, not on which ones they are.
+    After ``_MOST_RUNS`` no more are searched.
     """
-    kept = ((number, line) for number, line in enumerate(lines, 1) if is_row(line))
-    rows = [(number, _cells_of_row(line, layout)) for number, line in kept]
-    runs = [(cells, [number for number, _ in run]) for cells, run in groupby(rows, lambda row: row[1])]
-    tables = [run for run in runs if run[0] is not None and len(run[1]) > 1]
-    return runs, max(tables, key=lambda run: len(run[1]))[0] if tables else None
+
+    known = dict[str, Cells | bool]()  # False: no row
+
+    def kinds(lines: Sequence[str]) -> Iterable[Cells | bool]:
+        known.update((line, is_row(line) and _cells_of_row(line, layout)) for line in {*lines} - known.keys())
+        return map(known.__getitem__, lines)
+
+    runs, number = list[Run](), 0
+    for cells, equal in groupby(chain.from_iterable(kinds(lines_of(_DIGITS.sub(b"0", text))) for text in blocks)):
+        rows = len([*equal])
+        number += rows
+        if cells is not False and len(runs) <= _MOST_RUNS:
+            _, before, first, _ = runs.pop() if runs and runs[-1][0] == cells else (cells, 0, number - rows + 1, 0)
+            runs.append((cells, before + rows, first, number))
+    tables = [run for run in runs if run[0] is not None and run[1] > 1]
+    return runs, max(tables, key=lambda run: run[1])[0] if tables else None
 
 
 def _cells_of_row(line: str, layout: Layout) -> Cells:
@@ -338,8 +357,8 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
                 rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
                 first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
             if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
-                runs, longest = _runs(beginning.decode().splitlines(), layout) if line is not None else ([], None)
-                if any(numbers[0] < (line or 0) for cells, numbers in runs if longest is not None and cells == longest):
+                runs, longest = _runs([beginning], layout) if line is not None else ([], None)
+                if any(run[2] < (line or 0) for run in runs if longest is not None and run[0] == longest):
                     break  # rows like those of the longest block lie above the line
                 return layout
     assert first is not None, "every layout was refused"

@@ -286,14 +286,18 @@ def remedy_of_order(raw: RawTable, index: int) -> str:
     rising = [
         other for other, c in zip(raw.names, raw.columns, strict=True) if other != name and np.all(np.diff(c) > 0.0)
     ]
-    copies = np.setdiff1d(np.arange(len(time)), np.unique(np.column_stack(raw.columns), axis=0, return_index=True)[1])
+    equal = np.lexsort(raw.columns)  # equal rows one behind the other, the first one first
+    copies = np.sort(equal[1:][np.all([one[equal[1:]] == one[equal[:-1]] for one in raw.columns], axis=0)])
     order = np.argsort(time, kind="stable")
     rough = [sum(float(np.sum(np.abs(np.diff(c[rows])))) for c in raw.columns) for rows in (order, slice(None))]
     # A clock that stood still makes up for the lost time in one step.
     levels, counts = np.unique(time, return_counts=True)
     even = (time[-1] - time[0]) / (len(time) - 1)
     made_up = np.all(np.abs(np.diff(levels) - counts[:-1] * even)[counts[:-1] > 1] < 0.5 * even)
-    where = f"line {' '.join(map(str, raw.rows[back][:_MOST_LINES]))}{' …' if len(back) > _MOST_LINES else ''}"
+    where, repeated = (
+        f"line {' '.join(map(str, raw.rows[rows][:_MOST_LINES]))}{' …' if len(rows) > _MOST_LINES else ''}"
+        for rows in (back, copies)
+    )
     files, rows = f"at {counted(len(back), 'row')} ({where}): write a file of each record", counted(len(back), "row")
     still = "the clock stands still and then goes on; delete the rows with a repeated time:"
     causes = (
@@ -301,7 +305,7 @@ def remedy_of_order(raw: RawTable, index: int) -> str:
          f"{name} and {' '.join(rising)}, or their from in a column map"),
         (len(clock_starts(time)) and np.all(step[back - 1] < 0.0), f"the clock starts anew {files}"),
         (len(copies) and np.all(np.diff(np.delete(time, copies)) > 0.0),
-         f"delete the repeated rows: line {' '.join(map(str, raw.rows[copies]))}"),
+         f"delete the repeated rows: {repeated}"),
         (not falls and len(back) <= STANDS * len(time) and made_up, f"{still} {where}"),
         (not falls, f"the times are rounded, up to {counted(int(counts.max()), 'row')} share one: export them with more "
          "digits"),

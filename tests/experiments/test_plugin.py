@@ -10,6 +10,7 @@ import sysconfig
 import venv
 from collections.abc import Mapping
 from pathlib import Path
+from site import addsitedir
 from typing import Any
 
 import jax.numpy as jnp
@@ -167,6 +168,21 @@ def test_a_pth_file_names_a_folder_of_packages(packages: Path, tmp_path: Path, m
     assert {str(tmp_path), str(packages)} <= set(package_folders())
     monkeypatch.chdir(packages)
     assert str(packages) not in package_folders()
+
+
+def test_a_folder_added_by_site_holds_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: the kinds of such an overlay vanished without a word. A rig folder and what stands first never count."""
+    first, overlay, other, rig = (install(tmp_path / name) for name in ("first", "overlay", "other", "rig"))
+    (rig / "rig.toml").write_text("", encoding="utf-8")
+    (overlay / "more.pth").write_text(f"{other}\n", encoding="utf-8")
+    monkeypatch.setattr(sys, "path", [str(first), *sys.path])
+    for folder in (overlay, rig):
+        addsitedir(str(folder))
+    found = package_folders()
+    assert {str(overlay), str(other)} <= set(found)
+    assert not {str(first), str(rig)} & set(found)
+    monkeypatch.chdir(overlay)
+    assert str(overlay) not in package_folders()
 
 
 def test_its_parameters_and_settings_join_those_of_the_package(packages: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import capsule_id
+from capsule_id.rig import guess
 from capsule_id.rig.guess import find_layout
 from capsule_id.rig.model import Rig
 
@@ -100,3 +101,24 @@ def test_a_missing_first_cell_ends_no_block(tmp_path: Path) -> None:
     text = "T (s),X (mm)\n" + "\n".join([*rows, "Run 2", *rows[:20]]) + "\n"
     found = find_layout(text.encode(), tmp_path / "a.csv", ())
     assert found.blocks == ((2, 81), (83, 102))
+
+
+@pytest.mark.parametrize("row", ["{}", "{},{}", "-{}", "{};"])
+def test_long_texts_have_lines_below_their_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, row: str) -> None:
+    """Before: no blocks beyond 500,000 lines, and none of one column beyond the first 3000 lines."""
+    monkeypatch.setattr(guess, "_MOST_RUNS", 5)
+    head = "x [mm],t [s]\n" if "," in row else "x [mm]\n"
+    rows = "".join(f"{row.format(k, k)}\n" + "-1\n" * (row == "-{}") for k in range(1, 4001))
+    found = find_layout(f"{head}{rows}End of the record\n\nchecked\n".encode(), tmp_path / "a.csv", ())
+    number = rows.count("\n")
+    assert found.blocks == ((2, number + 1),)
+    assert len(found.columns[0]) == number
+
+
+def test_rows_that_change_too_often_have_no_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guess, "_MOST_RUNS", 5)
+    text = "x [mm]\n" + "1\n" * 3500 + "1,2\n3,4\n1\n2\n" * 10
+    with pytest.raises(capsule_id.InputError):
+        find_layout(text.encode(), tmp_path / "a.csv", ())
+    monkeypatch.setattr(guess, "_MOST_RUNS", 500)
+    assert len(find_layout(text.encode(), tmp_path / "a.csv", ()).blocks) == 11

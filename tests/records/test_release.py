@@ -213,3 +213,22 @@ def test_no_release_is_looked_for_in_a_viscous_decay(held: int, monkeypatch: pyt
     assert bool(searched) == (held > 0)
     assert abs(found.start - held * 0.01) <= 0.021
     assert found.period == pytest.approx(0.5, rel=0.02)
+
+
+@pytest.mark.parametrize(("zeta", "poles"), [(0.0, 1), (0.05, 1), (1.0, 2), (1.3, 2)])
+def test_a_column_costs_one_wave_of_two_conjugate_ones(zeta: float, poles: int) -> None:
+    """Before: both were computed, and real ones as complex numbers. The columns of the poles are derivatives."""
+    phase = np.linspace(0.0, 6.0, 200)
+    values = np.exp(-0.3 * phase) * np.cos(phase)
+    waves = release._motions(phase, zeta)[-1]
+    assert (len(waves), np.iscomplexobj(waves)) == (poles, poles == 1)
+    columns = release._columns(phase, zeta, values, 1e3)  # such errors hide the further forces
+    linear, h = np.column_stack([np.ones_like(phase), columns[:, 1:3]]), 1e-4
+    parts = np.linalg.lstsq(linear, values, rcond=1e-9)[0]
+    moved = [release._motions(phase * (1.0 + sign * h), zeta)[0] @ parts for sign in (-1.0, 1.0)]
+    np.testing.assert_allclose(columns[:, 3], (moved[1] - moved[0]) / (2.0 * h), atol=1e-3)
+    if zeta > 0.0:
+        damped = [release._motions(phase, zeta + sign * h)[0] @ parts for sign in (-1.0, 1.0)]
+        difference = columns[:, 4] - (damped[1] - damped[0]) / (2.0 * h)
+        left = difference - linear @ np.linalg.lstsq(linear, difference, rcond=1e-9)[0]
+        np.testing.assert_allclose(left, 0.0, atol=5e-3)

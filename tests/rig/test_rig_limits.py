@@ -1,5 +1,6 @@
 """Files of absurd size or nesting end in a located error, at once; white space inside a table is no part of a number."""
 
+import gzip
 import re
 import time
 from pathlib import Path
@@ -10,7 +11,9 @@ import pytest
 import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
-from capsule_id.rig.formats.raw import MOST_COLUMNS
+from capsule_id.rig.formats import EXPORTS, raw
+from capsule_id.rig.formats import text as texts
+from capsule_id.rig.formats.raw import MOST_COLUMNS, Layout
 from capsule_id.rig.formats.text import read_csv
 from capsule_id.rig.toml import DEEPEST_KEY, LARGEST_TEXT, closest, parse_toml
 from tests.cli_tools import small_rig
@@ -143,3 +146,54 @@ def test_the_length_of_one_board_is_stated_as_the_template_says(tmp_path: Path) 
         InputError, match=r"scale must not be 0, 0, write 1, or -1 .*; for a constant, state it as offset"
     ):
         capsule_id.read_rig(tmp_path)
+
+
+def test_a_compressed_text_counts_its_rows_and_readings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: an ordinary text of 74 MB was refused, and one of 33 million short rows took 2.7 GB."""
+    monkeypatch.setattr(raw, "SMALL_CONTENT", 4000)
+    long = "time [s],x_rel [mm]\n" + "".join(f"{k / 1000:.17f},{k % 7:.17f}\n" for k in range(150))
+    dense = "x_rel [mm]\n" + "1\n" * 900
+    packed = [gzip.compress(text.encode()) for text in (long, dense)]
+    assert len(long) > 4000 > len(dense)
+    assert len(read_csv(packed[0], Path("table.csv.gz")).columns[0]) == 150
+    with pytest.raises(InputError, match=r"a \.gz file of this size must hold at most"):
+        read_csv(packed[1], Path("table.csv.gz"))
+    with pytest.raises(InputError, match=r"a \.gz file of this size must hold at most"):
+        read_csv(gzip.compress((long + " " * 4000).encode()), Path("table.csv.gz"))
+
+
+def test_a_table_with_missing_cells_is_read_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: 16 MB of 2000 columns, one of them without readings, took 15 s: every cell was read by itself."""
+    seen = list[str]()
+    number_in = texts.number_in
+    monkeypatch.setattr(texts, "number_in", lambda cell, mark: seen.append(cell) or number_in(cell, mark))
+    row = ",".join(["1"] * 99) + ",--\n"
+    with pytest.raises(texts.MissingCellsError, match=r"^table.csv:2:199: a cell must be a number, '--'") as caught:
+        read_csv((",".join(f"c{i} [1]" for i in range(100)) + "\n" + row * 50).encode(), TABLE)
+    assert caught.value.texts == ("--",)
+    assert len(seen) < 10  # two kinds of cells
+
+
+def test_the_reader_in_c_reads_the_blocks_without_missing_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: one missing cell or a line below the readings sent all blocks to the slow reader."""
+    monkeypatch.setattr(raw, "BLOCK", 400)
+    slow = list[int]()
+    read_column = texts.read_column
+    monkeypatch.setattr(texts, "read_column", lambda cells, *rest: slow.append(len(cells)) or read_column(cells, *rest))
+    rows = "".join(f"{k}.5,{k}\n" for k in range(1000)) + "1.5,--\n"
+    export = EXPORTS[".csv"](("t [s],x [mm]\n" + rows).encode(), TABLE, Layout(missing=("--",)))
+    np.testing.assert_array_equal(export.values(1), [*range(1000), np.nan])
+    np.testing.assert_array_equal(export.values(0), [*(np.arange(1000) + 0.5), 1.5])
+    assert sum(slow) < 400
+
+
+def test_a_remedy_names_a_few_of_many_rows(tmp_path: Path) -> None:
+    """Before: an error of 31 MB that named four million rows."""
+    time = np.arange(40) / 100.0
+    rows = "".join(f"{t:.2f},{x:.5f}\n" * 2 for t, x in zip(time, np.cos(30.0 * time), strict=True))
+    (tmp_path / "d.csv").write_text(f"time [s],x_rel [mm]\n{rows}", encoding="utf-8")
+    entry = '[[experiment]]\nkind = "free_vibration"\nfile = "d.csv"\n'
+    (tmp_path / "rig.toml").write_text(f'[rig]\nname = "twice"\n{entry}', encoding="utf-8")
+    with pytest.raises(InputError, match=r"delete the repeated rows: line 3( [0-9]+){19} …") as caught:
+        capsule_id.read_rig(tmp_path)
+    assert len(str(caught.value)) < 500

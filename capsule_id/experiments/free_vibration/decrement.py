@@ -36,8 +36,8 @@ LIGHT_RATIOS, STRONG_RATIOS = (0.001, 0.01, 0.03, 0.1), (0.2, 0.4, 0.7, 1.0, 1.5
 SMALLEST_RATIO, LARGEST_SEARCHED, LARGEST_RATIO = 1e-6, 30.0, 0.9
 #: Unknowns of a viscous decay: k1, c, two initial conditions, offset.
 UNKNOWNS = 5
-#: Samples that are searched: at least, at most on the grid, and at most in the refinement.
-FEWEST_SEARCHED, MOST_SEARCHED, MOST_REFINED = 16, 1000, 20_000
+#: Samples that are searched: at least, at most on the grid, there first for a rough fit, and at most in the refinement.
+FEWEST_SEARCHED, MOST_SEARCHED, MOST_ROUGH, MOST_REFINED = 16, 1000, 100, 20_000
 #: Spectra with fewer periods are checked by a fit; its damping ratio beyond which a spectrum may have no peak.
 FEW_PERIODS, PEAKLESS = 4.0, 0.3
 #: Share of their trace that is added to normal equations, which may be singular.
@@ -258,19 +258,21 @@ def viscous_fit(
         parts = np.linalg.lstsq(design, values[part])[0]
         return ViscousFit(float(ratio * omega), float(omega**2), parts, values[part] - design @ parts)
 
-    few, fine = (slice(0, end, -(-end // most)) for most in (MOST_SEARCHED, MOST_REFINED))
+    rougher, few, fine = (slice(0, end, -(-end // most)) for most in (MOST_ROUGH, MOST_SEARCHED, MOST_REFINED))
     strongest = LARGEST_SEARCHED if unknowns == 2 else LARGEST_RATIO
     points = np.log([[*pair, 0.9] for pair in tried if unknowns == 2 or pair[1] < LARGEST_RATIO]).T[:unknowns]
     points = np.unique(points, axis=1)
-    # The part of each point in the sum of squares about the mean, by the normal equations.
-    moved = _motions(points, time[few], unknowns, order)
-    moved -= np.mean(moved, axis=1, keepdims=True)
-    square, product = np.swapaxes(moved, 1, 2) @ moved, (values[few] - np.mean(values[few])) @ moved
-    ridge = SINGULAR * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(square.shape[1])
-    taken = np.sum(product * np.linalg.solve(square + ridge, product[..., None])[..., 0], axis=1)
-    starts = points.T[np.argsort(-taken, kind="stable")[:REFINED]]
-    if rough > 0.0 and np.exp(starts[0][1]) < rough:
-        return fitted(starts[0], slice(None))
+    starts = points.T
+    for part in (rougher, few) if rough > 0.0 else (few,):
+        # The part of each point in the sum of squares about the mean, by the normal equations.
+        moved = _motions(points, time[part], unknowns, order)
+        moved -= np.mean(moved, axis=1, keepdims=True)
+        square, product = np.swapaxes(moved, 1, 2) @ moved, (values[part] - np.mean(values[part])) @ moved
+        ridge = SINGULAR * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(square.shape[1])
+        taken = np.sum(product * np.linalg.solve(square + ridge, product[..., None])[..., 0], axis=1)
+        starts = points.T[np.argsort(-taken, kind="stable")[:REFINED]]
+        if rough > 0.0 and np.exp(starts[0][1]) < rough:
+            return fitted(starts[0], slice(None))
     low, high = np.log([[0.1 * SLOWEST / length, SMALLEST_RATIO, 0.01], [np.pi / step, strongest, 1.0]])[:, :unknowns]
     ends = [
         least_squares(lambda z: fitted(z, fine).left / size, np.clip(z, low, high), bounds=(low, high), x_scale=0.1)

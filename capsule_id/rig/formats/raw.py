@@ -22,8 +22,8 @@ from capsule_id.errors import InputError
 #: Largest decompressed size of a file, bytes; of a small one the larger of ``SMALL_CONTENT`` and ``SPREAD`` times its own
 #: size. It stops files that grow without limit when they are unpacked.
 LARGEST_CONTENT, SMALL_CONTENT, SPREAD = 1 << 30, 1 << 26, 10
-#: Bytes that a reading counts: a text needs two to ten.
-READING = 4
+#: Bytes that a reading and a row of a text count: a text needs two to ten for a reading.
+READING, ROW = 4, 8
 #: Most series of readings in one array.
 MOST_SERIES = 200
 #: Longest line of a text, bytes; most columns of a table; most lines above its rows of numbers.
@@ -189,8 +189,11 @@ def _bytes_of(content: bytes, path: Path) -> bytes:
     if path.suffix.lower() != COMPRESSED:
         return content
     with complete(path, "compress it again by gzip"), gzip.open(io.BytesIO(content)) as file:
-        text = file.read(largest(content) + BLOCK)
-        refuse_large(len(text), content, path)
+        text = file.read(2 * largest(content) + BLOCK)
+        # Rows and readings take more memory than their text. What is long for its readings counts half: it takes less.
+        separators = sum(map(text.count, (b",", b";", b"\t", b" ", b"\n")))
+        size = max(len(text) // 2, ROW * text.count(b"\n"), min(len(text), READING * separators))
+        refuse_large(size, content, path)
     return text
 
 

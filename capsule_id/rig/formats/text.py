@@ -2,12 +2,14 @@
 
 import io
 import json
+import math
 import re
 import sys
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +101,7 @@ def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> 
 
 def is_beyond_floats(value: float, written: str) -> bool:
     """Whether ``value``, read from ``written``, is infinite, or 0 where another number is written."""
-    return not np.isfinite(value) or (value == 0.0 and re.search("[1-9]", re.split("[eE]", written)[0]) is not None)
+    return not math.isfinite(value) or (value == 0.0 and re.search("[1-9]", re.split("[eE]", written)[0]) is not None)
 
 
 def decimal_mark(texts: Sequence[str], missing: Sequence[str]) -> str | None:
@@ -130,7 +132,8 @@ def read_column(
     """
     mark = decimal or decimal_mark(texts, missing) or "."
     markers, values = frozenset(missing), np.full(len(texts), np.nan)
-    used = [k for k, text in enumerate(texts) if text not in markers] if missing else range(len(texts))
+    all_used = markers.isdisjoint(texts)
+    used = range(len(texts)) if all_used else [k for k, text in enumerate(texts) if text not in markers]
     if (_NUMBER_CHARACTERS | {mark}).issuperset("".join([texts[k] for k in used])):  # quickly, where all are numbers
         with suppress(ValueError):
             values[used] = [float(texts[k].replace(mark, ".")) for k in used]
@@ -290,6 +293,8 @@ def any_rows(
 ) -> Rows:
     """The rows of a text, with NaN at a missing marker, and the texts of the columns ``words``.
 
+    Blocks of numbers alone are read by the reader in C.
+
     Raises
     ------
     InputError
@@ -297,12 +302,21 @@ def any_rows(
     """
     rows = Rows({column: [] for column in columns}, {column: [] for column in words})
     marks = dict.fromkeys(columns, shape.decimal)
-    for number, text in file.blocks(shape.first):
-        kept = list(_rows_in(number, text))
+    for number, block in file.blocks(shape.first):
+        # No other decimal mark than that of the reader in C can be meant.
+        plain = shape.decimal or b"." not in block or {*marks.values()} == {"."}
+        values = plain_block(block, shape, columns) if plain and not words else None
+        if values is not None:
+            rows.blocks.append(np.arange(number, number + len(values), dtype=np.int32) + 1)
+            for column, one in zip(columns, values.T, strict=True):
+                rows.numbers[column].append(one)
+            continue
+        kept = list(_rows_in(number, block))
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         rows.blocks.append(np.array([line for line, _ in kept], np.int32) + 1)
+        turned = [*zip(*cells, strict=True)]
         for column in columns:
-            texts = [bare(row[column]) for row in cells]
+            texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column] if cells else ()
             if column in words:
                 rows.texts[column] += map(sys.intern, texts)
             marks[column] = marks[column] or decimal_mark(texts, missing)
@@ -430,10 +444,15 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
 
 def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
     """The columns, read cell by cell; raises at the first fault, and at missing readings where there is no other."""
-    path, columns, blank = file.path, shape.width, None
+    path, columns, mark, blank = file.path, shape.width, shape.decimal or ".", None
     missing: dict[str, InputError] = {}
-    assert shape.delimiter is not None, "a table has a separator"
-    values: list[array[float]] = [array("d") for _ in range(columns)]
+    values = array("d")
+
+    @lru_cache(1 << 16)  # short cells are many, but many of them are the same
+    def number(cell: str) -> float | None:
+        value = number_in(cell, mark)
+        return None if value is None or is_beyond_floats(value, cell) else value
+
     for line, text in enumerate(file.lines(shape.first), shape.first + 1):
         if not text.strip():
             blank = blank or line
@@ -447,7 +466,7 @@ def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
                 blank,
                 1,
             )
-        cells = cells_of(text, shape.delimiter)
+        cells = texts_of(text, shape.delimiter)
         if text.lstrip().startswith("#"):
             raise InputError(
                 "a row must be numbers", shown_cell(text.strip()), "remove comments from the table", path, line, 1
@@ -462,17 +481,22 @@ def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
                 remedy,
                 path,
                 line,
-                cells[columns][1] if len(cells) > columns else len(text) + 1,
+                place_of_cell(text, shape.delimiter, columns, len(text) + 1),
             )
-        for (cell, column), numbers in zip(cells, values, strict=True):
+        row = [*map(number, cells)]
+        if None not in row:
+            values.extend(row)
+            continue
+        for column in (k for k, one in enumerate(row) if one is None and cells[k] not in missing):
+            cell, place = cells[column], place_of_cell(text, shape.delimiter, column)
             try:
-                numbers.append(read_number(cell, shape.decimal or ".", path, line, column))
+                read_number(cell, mark, path, line, place)
             except InputError as error:
                 if cell.lower().strip("+-") not in _NO_READING:
                     raise
-                missing.setdefault(cell, error)
+                missing[cell] = error
     if missing:
         raise MissingCellsError(next(iter(missing.values())), tuple(missing))
-    if not values[0]:
+    if not values:
         raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
-    return tuple(np.array(numbers) for numbers in values)
+    return tuple(np.array(values).reshape(-1, columns).T.copy())
