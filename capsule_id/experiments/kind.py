@@ -230,8 +230,8 @@ def package_folders() -> list[str]:
     library, path = os.path.realpath(sysconfig.get_path("stdlib")), [*map(os.path.realpath, sys.path)]
     added = path[path.index(library) :] if library in path else []
     found = {os.path.realpath(folder): None for folder in (*own, *named, *added) if os.path.isdir(folder)}  # noqa: PTH112
-    rigs = {folder for folder in found if Path(folder, "rig.toml").exists()}
-    return [folder for folder in found if folder not in {*rigs, os.path.realpath(os.curdir)}]
+    working = os.path.realpath(os.curdir)
+    return [folder for folder in found if folder != working and not Path(folder, "rig.toml").exists()]
 
 
 @cache

@@ -302,15 +302,11 @@ def _motions(phase: np.ndarray, zeta: float) -> tuple[np.ndarray, np.ndarray, co
     """
     root = np.sqrt(complex(zeta**2 - 1.0))
     root = root if abs(root) > 1e-3 else 1e-3 + 0.0j
-    poles = np.array([[-zeta + root]]) if root.real == 0.0 else np.array([[-zeta + root.real], [-zeta - root.real]])
-    waves = np.exp(np.clip(poles.real * phase, -60.0, 60.0))
-    if root.real == 0.0:
-        waves = waves * np.exp(1j * root.imag * phase)
-        second = waves[0].imag / root.imag
-        first = waves[0].real + zeta * second
-    else:
-        second = (waves[0] - waves[1]) / (2.0 * root.real)
-        first = waves[0] - poles[0] * second
+    swings = root.real == 0.0
+    poles = np.array([[-zeta + root]]) if swings else np.array([[-zeta + root.real], [-zeta - root.real]])
+    waves = np.exp(np.clip(np.real(poles) * phase, -60.0, 60.0)) * (np.exp(1j * root.imag * phase) if swings else 1.0)
+    second = waves[0].imag / root.imag if swings else (waves[0] - waves[1]) / (2.0 * root.real)
+    first = np.real(waves[0]) - np.real(poles[0]) * second
     motions, rates = np.ones((2, 3, len(phase)))
     motions[1:], rates[:] = (first, second), (0.0 * phase, -second, first - 2.0 * zeta * second)
     return motions.T, rates.T, root, poles, waves
@@ -337,8 +333,9 @@ def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> n
         np.cumsum((pulled[..., 1:] + pulled[..., :-1]) * half, axis=2, out=parts[..., 1:])
         parts *= waves
         if root.real == 0.0:
-            return parts[:, 0].imag / root.imag, (poles[0] * parts[:, 0]).imag / root.imag
-        return tuple((one[:, 0] - one[:, 1]) / (2.0 * root.real) for one in (parts, poles * parts))
+            return np.imag(parts[:, 0]) / root.imag, np.imag(poles[0] * parts[:, 0]) / root.imag
+        size, rates = 2.0 * root.real, poles * parts
+        return (parts[:, 0] - parts[:, 1]) / size, (rates[:, 0] - rates[:, 1]) / size
 
     # The further forces have the prior ``FURTHER``.
     columns, wanted = np.zeros((6, n + 3)), np.zeros(n + 3)

@@ -281,17 +281,17 @@ def _runs(blocks: Iterable[bytes], layout: Layout) -> tuple[list[Run], Cells]:
     After ``_MOST_RUNS`` no more are searched.
     """
 
-    known = dict[str, Cells | bool]()  # False: no row
+    known = dict[str, Cells | Literal[False]]()  # False: no row
 
-    def kinds(lines: Sequence[str]) -> Iterable[Cells | bool]:
-        known.update((line, is_row(line) and _cells_of_row(line, layout)) for line in {*lines} - known.keys())
+    def kinds(lines: Sequence[str]) -> Iterable[Cells | Literal[False]]:
+        known.update((line, _cells_of_row(line, layout) if is_row(line) else False) for line in {*lines} - known.keys())
         return map(known.__getitem__, lines)
 
     runs, number = list[Run](), 0
     for cells, equal in groupby(chain.from_iterable(kinds(lines_of(_DIGITS.sub(b"0", text))) for text in blocks)):
         rows = len([*equal])
         number += rows
-        if cells is not False and len(runs) <= _MOST_RUNS:
+        if not isinstance(cells, bool) and len(runs) <= _MOST_RUNS:
             _, before, first, _ = runs.pop() if runs and runs[-1][0] == cells else (cells, 0, number - rows + 1, 0)
             runs.append((cells, before + rows, first, number))
     tables = [run for run in runs if run[0] is not None and run[1] > 1]

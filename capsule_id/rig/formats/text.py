@@ -449,9 +449,9 @@ def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
     values = array("d")
 
     @lru_cache(1 << 16)  # short cells are many, but many of them are the same
-    def number(cell: str) -> float | None:
+    def number(cell: str) -> float:
         value = number_in(cell, mark)
-        return None if value is None or is_beyond_floats(value, cell) else value
+        return math.nan if value is None or is_beyond_floats(value, cell) else value
 
     for line, text in enumerate(file.lines(shape.first), shape.first + 1):
         if not text.strip():
@@ -484,10 +484,8 @@ def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
                 place_of_cell(text, shape.delimiter, columns, len(text) + 1),
             )
         row = [*map(number, cells)]
-        if None not in row:
-            values.extend(row)
-            continue
-        for column in (k for k, one in enumerate(row) if one is None and cells[k] not in missing):
+        values.extend(row)
+        for column in (k for k, one in enumerate(row) if math.isnan(one) and cells[k] not in missing):
             cell, place = cells[column], place_of_cell(text, shape.delimiter, column)
             try:
                 read_number(cell, mark, path, line, place)
