@@ -216,7 +216,7 @@ def _built_in(name: str) -> Kind:
 def package_folders() -> list[str]:
     """The folders of installed packages: those of the interpreter and of the user, and what their ``.pth`` files name.
 
-    Of ``sys.path`` what stands behind the standard library counts: there ``site.addsitedir`` puts its folders. What stands
+    Of ``sys.path`` the absolute folders behind the standard library count: there ``site.addsitedir`` puts its own. What stands
     before it may be the working folder, which may be a rig folder that somebody else made. The working folder and rig
     folders never count; an editable install of a package in them has its metadata beside the ``.pth`` file.
     """
@@ -227,11 +227,17 @@ def package_folders() -> list[str]:
         with suppress(OSError):
             lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
             named += [str(file.parent / line.strip()) for line in lines if line.strip()]
-    library, path = os.path.realpath(sysconfig.get_path("stdlib")), [*map(os.path.realpath, sys.path)]
+    # What Python itself would leave out may stand there, and relative folders, which it does not add.
+    path = [
+        os.path.realpath(one)
+        for one in sys.path
+        if isinstance(one, str) and Path(one).is_absolute() and "\0" not in one
+    ]
+    library = os.path.realpath(sysconfig.get_path("stdlib"))
     added = path[path.index(library) :] if library in path else []
     found = {os.path.realpath(folder): None for folder in (*own, *named, *added) if os.path.isdir(folder)}  # noqa: PTH112
     working = os.path.realpath(os.curdir)
-    return [folder for folder in found if folder != working and not Path(folder, "rig.toml").exists()]
+    return [folder for folder in found if folder != working and not os.path.exists(f"{folder}/rig.toml")]  # noqa: PTH110
 
 
 @cache

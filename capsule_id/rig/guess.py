@@ -6,7 +6,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, groupby, pairwise, product
+from itertools import chain, groupby, pairwise, product, takewhile
 from pathlib import Path
 from typing import Literal
 
@@ -278,7 +278,7 @@ def _runs(blocks: Iterable[bytes], layout: Layout) -> tuple[list[Run], Cells]:
     """Runs of lines with equal cells, and the cells of the longest run of two rows or more.
 
     Blank lines and comments are left out. What a line is depends on where its digits stand, not on which ones they are.
-    After ``_MOST_RUNS`` no more are searched.
+    After ``_MOST_RUNS`` no more are searched; [] and None for a text with more lines than that which differ in this.
     """
 
     known = dict[str, Cells | Literal[False]]()  # False: no row
@@ -288,12 +288,15 @@ def _runs(blocks: Iterable[bytes], layout: Layout) -> tuple[list[Run], Cells]:
         return map(known.__getitem__, lines)
 
     runs, number = list[Run](), 0
-    for cells, equal in groupby(chain.from_iterable(kinds(lines_of(_DIGITS.sub(b"0", text))) for text in blocks)):
+    few = takewhile(lambda _: len(known) <= _MOST_RUNS, blocks)
+    for cells, equal in groupby(chain.from_iterable(kinds(lines_of(_DIGITS.sub(b"0", text))) for text in few)):
         rows = len([*equal])
         number += rows
         if not isinstance(cells, bool) and len(runs) <= _MOST_RUNS:
             _, before, first, _ = runs.pop() if runs and runs[-1][0] == cells else (cells, 0, number - rows + 1, 0)
             runs.append((cells, before + rows, first, number))
+    if len(known) > _MOST_RUNS:
+        return [], None
     tables = [run for run in runs if run[0] is not None and run[1] > 1]
     return runs, max(tables, key=lambda run: run[1])[0] if tables else None
 

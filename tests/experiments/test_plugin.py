@@ -181,6 +181,11 @@ def test_a_folder_added_by_site_holds_packages(tmp_path: Path, monkeypatch: pyte
     found = package_folders()
     assert {str(overlay), str(other)} <= set(found)
     assert not {str(first), str(rig)} & set(found)
+    # What Python itself leaves out, and a relative folder: none counts, none is an error.
+    monkeypatch.chdir(rig)
+    found = package_folders()
+    monkeypatch.setattr(sys, "path", [*sys.path, None, 3, b"x", "..", "a\0b"])
+    assert package_folders() == found
     monkeypatch.chdir(overlay)
     assert str(overlay) not in package_folders()
 

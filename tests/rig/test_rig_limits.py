@@ -11,9 +11,10 @@ import pytest
 import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
+from capsule_id.rig import guess
 from capsule_id.rig.formats import EXPORTS, raw
 from capsule_id.rig.formats import text as texts
-from capsule_id.rig.formats.raw import MOST_COLUMNS, Layout
+from capsule_id.rig.formats.raw import MOST_COLUMNS, Layout, TextFile
 from capsule_id.rig.formats.text import read_csv
 from capsule_id.rig.toml import DEEPEST_KEY, LARGEST_TEXT, closest, parse_toml
 from tests.cli_tools import small_rig
@@ -155,6 +156,8 @@ def test_a_compressed_text_counts_its_rows_and_readings(monkeypatch: pytest.Monk
     dense = "x_rel [mm]\n" + "1\n" * 900
     packed = [gzip.compress(text.encode()) for text in (long, dense)]
     assert len(long) > 4000 > len(dense)
+    with pytest.raises(InputError, match=r"a \.gz file of this size must hold at most"):
+        read_csv(gzip.compress(dense.replace("\n", "\r").encode()), Path("table.csv.gz"))
     assert len(read_csv(packed[0], Path("table.csv.gz")).columns[0]) == 150
     with pytest.raises(InputError, match=r"a \.gz file of this size must hold at most"):
         read_csv(packed[1], Path("table.csv.gz"))
@@ -197,3 +200,23 @@ def test_a_remedy_names_a_few_of_many_rows(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"delete the repeated rows: line 3( [0-9]+){19} …") as caught:
         capsule_id.read_rig(tmp_path)
     assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("last", ["", "1.5,--\n", '# "the end"\n'])
+@pytest.mark.parametrize("size", [400, 1 << 20])
+def test_a_marker_that_is_a_number_is_no_reading(monkeypatch: pytest.MonkeyPatch, last: str, size: int) -> None:
+    """Before: -999 was a reading in every block of numbers alone; a block of comments alone ended in an IndexError."""
+    monkeypatch.setattr(raw, "BLOCK", size)
+    rows = "".join(f"{k}.5,{-999 if k % 40 == 7 else k}\n" for k in range(200))
+    export = EXPORTS[".csv"](("t [s],x [mm]\n" + rows + last).encode(), TABLE, Layout(missing=("--", "-999")))
+    expected = np.where(np.arange(200) % 40 == 7, np.nan, np.arange(200.0))
+    np.testing.assert_array_equal(export.values(1), np.append(expected, [np.nan] * ("--" in last)))
+
+
+def test_a_text_of_different_lines_is_not_searched_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: every different line was kept, whatever their number."""
+    monkeypatch.setattr(guess, "_MOST_RUNS", 100)
+    lines = [f"{''.join(map(chr, (97 + k // 26, 97 + k % 26)))},k" for k in range(500)]
+    table = [f"{k},{k}" for k in range(30)]
+    assert guess._blocks(TextFile("\n".join([*table, *lines, *table]).encode(), TABLE), Layout()) == ()
+    assert len(guess._blocks(TextFile("\n".join([*table, *lines[:50], *table]).encode(), TABLE), Layout())) == 2

@@ -40,9 +40,10 @@ from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
-from capsule_id.physics.forces import equilibrium, scaled
+from capsule_id.physics.forces import FrictionLaw, equilibrium, scaled
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, without_absent
 from capsule_id.physics.simulation import simulate
+from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 
@@ -287,10 +288,7 @@ class Progression(CapsuleForward):
         p, drive, law, r0, period, count = lanes
         if self.smoothing is None:
             return displacement(p, drive, law, period, count, r0).X2.reshape(s.shape)
-        times = xp.stack([xp.zeros_like(period), period * count], axis=1)
-        rest = (r0, 0.0, 0.0, 0.0)
-        t = simulate(p, drive, times, rest, model="smooth", smoothing=self.smoothing, friction=law)
-        return t.X2[:, 1].reshape(s.shape)
+        return _smoothed(p, drive, law, r0, period * count, self.smoothing).reshape(s.shape)
 
     def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
         """(draws, runs) X2 for which the likelihood runs the capsule; not finite where a run fails."""
@@ -465,3 +463,11 @@ class Progression(CapsuleForward):
         limits = band(trials * speed if chosen else trials)
         residuals = np.asarray(self.residuals(theta, np))[: self.n]
         return self.speed_panels(settings, centre, limits, "this fit, 95 % band of a new trial", residuals)
+
+
+@eqx.filter_jit
+def _smoothed(p: CapsuleParameters, drive: Drive, law: FrictionLaw, r0: Any, time: Any, smoothing: Smoothing) -> Any:
+    """(lanes,) X2 after ``time`` by the smoothed engine; not finite where a run fails, one without a normal force too."""
+    times = jnp.stack([jnp.zeros_like(time), time], axis=1)
+    rest = (r0, 0.0, 0.0, 0.0)
+    return simulate(p, drive, times, rest, model="smooth", smoothing=smoothing, friction=law).X2[:, 1]

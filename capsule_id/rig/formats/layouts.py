@@ -25,6 +25,7 @@ from capsule_id.rig.formats.text import (
     COMMENTS,
     Shape,
     any_rows,
+    are_words,
     bare,
     cells_of,
     is_comment,
@@ -88,7 +89,7 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
-    rows = None if words else plain_rows(file, shape, wanted)
+    rows = plain_rows(file, shape, wanted) if not words and are_words(layout.missing) else None
     rows = rows or any_rows(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
 
     lines = rows.lines

@@ -191,8 +191,9 @@ def _bytes_of(content: bytes, path: Path) -> bytes:
     with complete(path, "compress it again by gzip"), gzip.open(io.BytesIO(content)) as file:
         text = file.read(2 * largest(content) + BLOCK)
         # Rows and readings take more memory than their text. What is long for its readings counts half: it takes less.
-        separators = sum(map(text.count, (b",", b";", b"\t", b" ", b"\n")))
-        size = max(len(text) // 2, ROW * text.count(b"\n"), min(len(text), READING * separators))
+        rows = max(map(text.count, (b"\n", b"\r")))
+        separators = rows + sum(map(text.count, (b",", b";", b"\t", b" ")))
+        size = max(len(text) // 2, ROW * rows, min(len(text), READING * separators))
         refuse_large(size, content, path)
     return text
 

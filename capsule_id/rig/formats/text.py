@@ -288,6 +288,11 @@ def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | N
     return rows
 
 
+def are_words(missing: Sequence[str]) -> bool:
+    """Whether no missing marker is a number, such as -999: the reader in C would take it for a reading."""
+    return all(number_in(marker, mark) is None for marker in missing for mark in ".,")
+
+
 def any_rows(
     file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str], words: Sequence[int] = ()
 ) -> Rows:
@@ -301,11 +306,11 @@ def any_rows(
         If a row has another number of cells than the first one.
     """
     rows = Rows({column: [] for column in columns}, {column: [] for column in words})
-    marks = dict.fromkeys(columns, shape.decimal)
+    marks, alone = dict.fromkeys(columns, shape.decimal), not words and are_words(missing)
     for number, block in file.blocks(shape.first):
         # No other decimal mark than that of the reader in C can be meant.
         plain = shape.decimal or b"." not in block or {*marks.values()} == {"."}
-        values = plain_block(block, shape, columns) if plain and not words else None
+        values = plain_block(block, shape, columns) if plain and alone else None
         if values is not None:
             rows.blocks.append(np.arange(number, number + len(values), dtype=np.int32) + 1)
             for column, one in zip(columns, values.T, strict=True):
@@ -314,9 +319,9 @@ def any_rows(
         kept = list(_rows_in(number, block))
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         rows.blocks.append(np.array([line for line, _ in kept], np.int32) + 1)
-        turned = [*zip(*cells, strict=True)]
+        turned = [*zip(*cells, strict=True)] or [()] * shape.width
         for column in columns:
-            texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column] if cells else ()
+            texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
             if column in words:
                 rows.texts[column] += map(sys.intern, texts)
             marks[column] = marks[column] or decimal_mark(texts, missing)
