@@ -216,6 +216,7 @@ def later_start(e: DecayRecord) -> Facts:
     size = np.abs(e.values - equilibrium(e.values))
     begin = int(np.flatnonzero(size > 0.5 * np.max(size))[-1]) + 1
     left = e.time[begin:][: length_of_motion(e.values[begin:])] if begin < len(e.time) else e.time[:0]
+    # Half of what a record needs whose halves are compared.
     if len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_SWINGS // 2:
         return {"start": None}
     digits = max(0, int(np.ceil(-np.log10(median_step(e.time)))))

@@ -14,7 +14,6 @@ from capsule_id.experiments.free_vibration.decrement import STRONGEST, viscous_s
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FURTHER,
-    READINGS_PER_PERIOD,
     block_size,
     decay_window,
     natural_units,
@@ -92,8 +91,8 @@ def _units(e: Decay, theta: Mapping[str, float]) -> dict[str, float]:
 
 #: Half swings that are looked at, from the release on, and fewest of a record that is judged.
 MOST_HALF_SWINGS, FEWEST_HALF_SWINGS = 60, 8
-#: Fewest readings, or means of readings, per half swing, and fewest of all, without those near turning points.
-FEWEST_READINGS, FEWEST_OF_ALL = 6, 200
+#: Most and fewest readings, or means of readings, per half swing, and fewest of all, without those near turning points.
+MOST_READINGS, FEWEST_READINGS, FEWEST_OF_ALL = 64, 6, 200
 #: Readings nearer to a turning point than this part of a half swing are left out: a zero may jump a little later.
 NEAR = 0.1
 #: A rod moves where it is faster than this part of its largest speed.
@@ -120,7 +119,7 @@ def zero_jumps(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | N
         return None
     begin = float(decay_window(e.table)[0][0])
     settings = replace(e.table.settings, start=begin, stop=begin + float(min(end, time[-1])))
-    thin = block_size(time[time <= end], values[time <= end], 4.0 * READINGS_PER_PERIOD)
+    thin = block_size(time[time <= end], values[time <= end], 2.0 * MOST_READINGS)
     model = replace(e.model, thin=thin, noise="white", drift="none")
     part = e.with_model(model, table=replace(e.table, settings=settings))
     left, design, moved = sensitivities(part, theta)

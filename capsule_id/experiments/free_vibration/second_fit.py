@@ -26,7 +26,6 @@ from capsule_id.experiments.free_vibration.models import (
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FEWEST_PER_PERIOD,
-    LONGEST_WHOLE,
     MOST_PERIODS,
     READINGS_PER_PERIOD,
     DecayModel,
@@ -389,6 +388,8 @@ class Screening:
 # then fitted to the record by maximum likelihood and ranked by BIC.
 
 
+#: Largest number of samples of a record that is no free decay.
+LONGEST_UNCUT = 1000
 #: Of forces whose BIC differs by less, the fewest are chosen: with seven alternatives, noise alone often gains this much.
 BIC_MARGIN = 4.0
 #: Shorter records, in samples, keep their model, and shorter halves of a record are not fitted. A thinned record has twice
@@ -508,6 +509,7 @@ def demanded_model(records: Sequence[DecayRecord]) -> Ranking:
     noise. The fits of fewer forces become starts of the quoted fit.
     """
     forces, others = open_models(records[0])
+    # Half of the readings that a quoted fit has rank the models as well.
     coarse = min(thinning(record, 0.5 * READINGS_PER_PERIOD) for record in records)
     thinned = [Screening(record, coarse) for record in records]
     by_forces = rank(thinned, [replace(model, noise=others[-1].noise) for model in forces])
@@ -625,7 +627,7 @@ def second_models(
     for i, record in enumerate(records):
         settings = record.table.settings
         if record.label in no_decay and None in settings.choices:
-            thin = settings.thin or max(1, 2 * len(record.whole[0]) // LONGEST_WHOLE)
+            thin = settings.thin or max(1, len(record.whole[0]) // LONGEST_UNCUT)
             kept[i] = record.with_model(replace(record.model, thin=thin))
             findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "thin": thin}, record.label))
     judged = (i for i, record in enumerate(records) if record.label not in no_decay)

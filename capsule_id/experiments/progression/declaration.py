@@ -248,8 +248,8 @@ KIND = Kind(
 def settings_of(columns: Mapping[str, Column], settings: ProgressionSettings) -> tuple[np.ndarray, str]:
     """(n, 4) period, s, number of periods, duty and amplitude of every row; where the amplitude comes from.
 
-    The amplitude is from a "column" (N) or a "current" (A), or a parameter with
-    a "prior", or "exact"; it is 1 in the last two cases.
+    The amplitude is from a "column" (N) or a "current" (A), or a parameter with a "prior", or "exact"; it is 1 in the last
+    two cases.
     """
     values = {name: column.values for name, column in columns.items()}
     period = values["period"] if "period" in values else 1.0 / values["f"]
