@@ -11,11 +11,12 @@ from typing import cast
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.optimize import least_squares
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.experiments.base import refit
+from capsule_id.experiments.base import further_columns, refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.hidden_terms import Hidden, check_hidden_terms, hidden_terms
 from capsule_id.experiments.free_vibration.lint import MESSAGES
@@ -234,3 +235,17 @@ def test_the_limit_of_a_force_far_below_zero_is_small() -> None:
         low, high = Hidden(ratio, 1.0, {}, {}).limits(False)
         assert low == 0.0
         assert 0.0 < high < 0.2
+
+
+def test_the_f_test_of_one_column_is_the_t_test_of_a_slope() -> None:
+    """Against ``scipy.stats.linregress``, with so few readings that the degrees of freedom decide."""
+    rng = np.random.default_rng(3)
+    x, y = rng.standard_normal((2, 7))
+    found = stats.linregress(x, y)
+    F, p, (effect,) = further_columns(np.ones((7, 1)), x[:, None], y)
+    assert pytest.approx((found.slope / found.stderr) ** 2, rel=1e-9) == F
+    assert p == pytest.approx(found.pvalue, rel=1e-9)
+    assert np.sign(effect) == np.sign(found.slope)
+    # A column that is a multiple of another counts once, and too few readings tell nothing.
+    assert further_columns(np.ones((7, 1)), np.stack([x, 2.0 * x], axis=1), y)[1] == pytest.approx(p, rel=1e-6)
+    assert np.isnan(further_columns(np.ones((3, 1)), rng.standard_normal((3, 2)), y[:3])[1])
