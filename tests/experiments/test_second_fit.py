@@ -113,7 +113,7 @@ def test_a_record_with_two_excitations_keeps_its_model(monkeypatch: pytest.Monke
     (same,), (finding,) = second_models([uncut], readings)
     assert same.model == uncut.model
     assert (finding.code, finding.level) == ("decays.first_fit", "warn")
-    monkeypatch.setattr("capsule_id.experiments.free_vibration.second_fit.LONGEST_WHOLE", 200)
+    monkeypatch.setattr("capsule_id.experiments.free_vibration.second_fit.LONGEST_UNCUT", 100)
     (thinned,), (finding,) = second_models([uncut], readings)
     assert (thinned.model, thinned.replaced) == (DecayModel(thin=5), False)
     assert "means of 5 samples" in MESSAGES["decays.first_fit"].text("warn", finding.facts)
