@@ -4,7 +4,7 @@ import threading
 import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -14,9 +14,8 @@ from scipy.optimize import minimize
 from capsule_id.console import stop_if_interrupted, threads
 from capsule_id.errors import InputError
 from capsule_id.experiments.misfit import Misfit, Moments
-from capsule_id.inference import least_squares as difference_descent
 from capsule_id.inference.curvature import covariance
-from capsule_id.inference.least_squares import LeastSquaresFit, Solver, least_squares, linearised
+from capsule_id.inference.least_squares import KINKED, LeastSquaresFit, Solver, least_squares, linearised
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.point_fit import AGREEMENT, described, dispersed_starts
 from capsule_id.inference.result import PointFit
@@ -91,12 +90,19 @@ def _descended(target: LogPosterior, candidates: np.ndarray, value: np.ndarray) 
     if len(chosen):
         ends = candidates[chosen]
         for u in ends:
-            u[target.located] = difference_descent.descend(target, u, FIRST_STEPS).x[0]
+            u[target.located] = descended(target, u, FIRST_STEPS).x[0]
         reached = weigh(target, ends)
         # Squares may fall while the log-posterior does too, because the scatter of a trial depends on the motion.
         higher = reached > value[chosen]
         candidates[chosen[higher]], value[chosen[higher]] = ends[higher], reached[higher]
     return candidates, value
+
+
+def descended(target: LogPosterior, u: np.ndarray, steps: int | None = None) -> LeastSquaresFit:
+    """Minimise half the squared residuals over the located parameters from u (d,), in ``steps`` steps; the scatters stay."""
+    solver = KINKED if target.kinked else SOLVER
+    solver = replace(solver, max_steps=steps or solver.max_steps)
+    return least_squares(partial(linearised, target, u), u[target.located][None], solver)
 
 
 def weigh(target: LogPosterior, u: np.ndarray) -> np.ndarray:
@@ -234,11 +240,7 @@ def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
 
 def _compile_descent(target: LogPosterior) -> None:
     """Compile what ``_descend`` computes at a point."""
-    u = dispersed_starts(target, 0, 1)
-    if target.kinked:
-        in_batches(partial(difference_descent.rows_of, target), u, difference_descent.ROWS)
-    else:
-        linearised(target, u[0], u[0, target.located])
+    linearised(target, dispersed_starts(target, 0, 1)[0])
 
 
 def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
@@ -298,13 +300,9 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
     """Descend from one start (d,); stop where the cost exceeds ``limit`` or a number is not finite."""
     located = target.located
     u, still, fit = start.copy(), False, None
-    kinked = target.kinked
-    for _ in range(ROUNDS_WITH_KINKS if kinked else ROUNDS):
+    for _ in range(ROUNDS_WITH_KINKS if target.kinked else ROUNDS):
         stop_if_interrupted()
-        if kinked:
-            fit = difference_descent.descend(target, u)
-        else:
-            fit = least_squares(partial(linearised, target, u), u[located][None], SOLVER)
+        fit = descended(target, u)
         if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):
             return _End(u, fit, False, -np.inf)
         sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))

@@ -1,7 +1,7 @@
 """Nonlinear least squares from several starts, by derivatives or by differences."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from capsule_id.inference.curvature import (
     Residuals,
     column_space,
 )
-from capsule_id.inference.target import LogPosterior
+from capsule_id.inference.target import HEAVY, LogPosterior
 from capsule_id.physics.batches import in_batches, pool
 from capsule_id.precision import COMPILE, COMPILE_QUICKLY
 
@@ -189,10 +189,24 @@ def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bo
     return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
 
-def linearised(target: LogPosterior, u: np.ndarray, x: np.ndarray, heavy: bool = True) -> tuple[Residuals, Jacobian]:
-    """Residuals (n,) of ``target`` at u (d,) with the located entries x (l,), and their Jacobian (n, l)."""
-    moved = u.copy()
-    moved[target.located] = x
+def linearised(target: LogPosterior, u: np.ndarray, x: np.ndarray | None = None) -> tuple[Residuals, Jacobian]:
+    """Residuals (n,) of ``target`` at u (d,) and their Jacobian (n, l) with respect to its located entries.
+
+    x : (l,) located entries in the place of those of u
+
+    Where residuals have kinks, the derivatives are differences.
+    """
+    moved, located = u.copy(), target.located
+    if x is not None:
+        moved[located] = x
+    if target.kinked:
+        step = DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd)[located]
+        points = np.repeat(moved[None], len(located) + 1, axis=0)
+        points[1:, located] += np.diag(step)
+        residuals = in_batches(partial(rows_of, target), points, ROWS)
+        return residuals[0], (residuals[1:] - residuals[0]).T / step
+    # Where an evaluation takes long, it takes five times as long without XLA's optimisation.
+    heavy = target.work >= HEAVY or any(e.event_driven for e in target.experiments)
     residuals, jacobian = _PROGRAMS[heavy](target, jnp.asarray(moved))
     return np.asarray(residuals), np.asarray(jacobian)
 
@@ -231,10 +245,8 @@ def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     return scale, unit if unit > 0 else 1.0
 
 
-# difference descent: Derivatives by differences, for models whose residuals have kinks in the parameters.
-#
-# Derivatives at a point say little about a motion that sticks a step later on its other side. Differences over a finite
-# step smooth the kinks, and a batch computes the residuals of all of them.
+# Residuals with kinks: derivatives at a point say little about a motion that sticks a step later on its other side.
+# Differences over a finite step smooth the kinks, and a batch computes the residuals of all of them.
 
 
 #: Rows of a batch of residuals.
@@ -243,20 +255,6 @@ ROWS = 8
 DIFFERENCE = 2e-3
 #: Solver settings. Where derivatives change within a step, a light first damping leads to a wrong maximum.
 KINKED = Solver(tolerance=3e-3, max_steps=20, heavy=True, damping=1e-3)
-
-
-def descend(target: LogPosterior, u: np.ndarray, most: int = KINKED.max_steps) -> LeastSquaresFit:
-    """Minimise half the squared residuals over the located parameters from u (d,) in ``most`` steps; the scatters stay."""
-    located = target.located
-    step = DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd)[located]
-
-    def differences(x: np.ndarray) -> tuple[Residuals, Jacobian]:
-        points = np.repeat(u[None], len(located) + 1, axis=0)
-        points[:, located] = np.concatenate([x[None], x + np.diag(step)])
-        residuals = in_batches(partial(rows_of, target), points, ROWS)
-        return residuals[0], (residuals[1:] - residuals[0]).T / step
-
-    return least_squares(differences, u[located][None], replace(KINKED, max_steps=most))
 
 
 @partial(jax.jit, compiler_options=COMPILE)

@@ -19,7 +19,7 @@ from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.curvature import require_width
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target import LogPosterior, Scale
+from capsule_id.inference.target import HEAVY, LogPosterior, Scale
 from capsule_id.physics.batches import BATCH, in_batches
 from capsule_id.precision import COMPILE
 
@@ -185,8 +185,8 @@ FARTHEST_WITH_KINKS = 20.0
 EMULATED_NODES, EMULATED_ERROR, PLACES = (16, 32, 64, 128), 0.02, 512
 
 
-#: Rows that are evaluated together where each takes more than this work, in readings: more would leave the caches.
-ROWS_TOGETHER, HEAVY = 8, 30_000
+#: Rows that are evaluated together where each takes more than ``HEAVY`` work: more would leave the caches.
+ROWS_TOGETHER = 8
 
 
 @dataclass(frozen=True)

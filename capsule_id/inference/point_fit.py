@@ -13,9 +13,9 @@ from scipy.linalg import solve_triangular
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import Experiment
-from capsule_id.inference.curvature import Jacobian, covariance, hessian, jacobian
+from capsule_id.inference.curvature import Jacobian, covariance, hessian
 from capsule_id.inference.least_squares import Solver, least_squares, linearised
-from capsule_id.inference.marginal import HEAVY, density_of
+from capsule_id.inference.marginal import density_of
 from capsule_id.inference.result import STATED, PointFit
 from capsule_id.inference.target import LogPosterior, prior_of
 from capsule_id.parameters import is_stated
@@ -90,8 +90,6 @@ LOG_POSTERIOR_FLOOR = -1e12
 #: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
 #: until the prior stops it. Quasi-Newton reaches that point in fewer steps.
 BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=40)
-#: Relative step of the difference quotients of residuals; their relative error is about 1e-10.
-DIFFERENCE = 1e-5
 
 
 def point_fit(
@@ -116,14 +114,14 @@ def point_fit(
     kept = np.union1d(np.arange(reported), best)
     starts, u, value, converged = (each[kept] for each in (starts, u, value, converged))
     best = int(np.searchsorted(kept, best))
-    at_fit = residual_jacobian(target, u[best])
+    _, at_fit = linearised(target, u[best])
     root = _root_of_covariance(target, u[best], at_fit)
     spread = np.sqrt(np.sum(root**2, axis=1))
     return described(
         target,
         u[best],
-        at_fit[:, target.located],
-        target.residual_owners(u[best], plain=True),
+        at_fit,
+        target.residual_owners(u[best]),
         covariance=root @ root.T,
         starts=starts,
         ends=u,
@@ -139,9 +137,7 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:
         compiled = pool.submit(density, np.repeat(starts[:1], BATCH, axis=0))
-        # Where an evaluation takes long, it takes five times as long without XLA's optimisation.
-        residuals = partial(linearised, target, starts[0], heavy=target.work >= HEAVY)
-        rough = least_squares(residuals, starts[:, located], BASIN_SOLVER)
+        rough = least_squares(partial(linearised, target, starts[0]), starts[:, located], BASIN_SOLVER)
         compiled.result()
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
@@ -149,7 +145,7 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     before, after = in_batches(density, starts), in_batches(density, ends)
     ends = np.where((after >= before)[:, None], ends, starts)
     best = int(np.argmax(np.nan_to_num(np.fmax(before, after), nan=-np.inf)))
-    whitening = _root_of_covariance(target, ends[best], residual_jacobian(target, ends[best]))
+    whitening = _root_of_covariance(target, ends[best], linearised(target, ends[best])[1])
     # Every batch runs in the pool of threads, so the starts need their own.
     with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
         # SciPy hides this warning itself, but its way is not safe in threads.
@@ -157,7 +153,7 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
         highest = _polish(density, ends[best], whitening)
         if not highest[2]:
             # The best end of least squares may lie far from the maximum, where the curvature is another one.
-            whitening = _root_of_covariance(target, highest[0], residual_jacobian(target, highest[0]))
+            whitening = _root_of_covariance(target, highest[0], linearised(target, highest[0])[1])
             highest = _polish(density, highest[0], whitening)
         # An end of least squares within a fraction of a standard deviation leads to the same maximum.
         spread = np.sqrt(np.sum(whitening**2, axis=1))
@@ -206,7 +202,7 @@ def _polish(
 
 
 def _root_of_covariance(target: LogPosterior, u: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """R (d, d) with R R' the inverse Hessian of -log-posterior at u (d,), from the ``jacobian`` (n, d) of the residuals.
+    """R (d, d) with R R' the inverse Hessian of -log-posterior at u (d,), from the ``jacobian`` (n, located) of the residuals.
 
     The Hessian is taken in coordinates that are whitened by Gauss-Newton's approximation, by an orthogonal factor. Where
     the readings determine k1/m1 to six digits and m1 to two, no digit of the Hessian in u itself would be left.
@@ -218,19 +214,13 @@ def _root_of_covariance(target: LogPosterior, u: np.ndarray, jacobian: np.ndarra
             if row.scatter:
                 count[target.names.index(row.name)] += 2.0 * experiment.n
     whitening = np.diag(np.maximum(count, 1e-2) ** -0.5)
-    triangle = np.linalg.qr(np.nan_to_num(jacobian[:, located], posinf=0.0, neginf=0.0), mode="r")
+    triangle = np.linalg.qr(np.nan_to_num(jacobian, posinf=0.0, neginf=0.0), mode="r")
     whitening[np.ix_(located, located)] = solve_triangular(triangle, np.eye(len(located)))
     density = density_of(target)
     curvature = hessian(lambda w: density(u + w @ whitening.T), np.zeros(len(u)), np.ones(len(u)))
     # Away from a maximum a direction may have no positive curvature; there Gauss-Newton's stands.
     values, vectors = np.linalg.eigh(np.nan_to_num(-curvature, nan=0.0, posinf=0.0, neginf=0.0))
     return whitening @ (vectors / np.sqrt(np.where(values > FLATTEST, values, 1.0)))
-
-
-def residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
-    """(n, d) Jacobian of the standardised residuals, scatters in the denominator included."""
-    # Steps are relative, or fractions of the prior's sd where u is not a logarithm.
-    return jacobian(target.plain_residuals, u, DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd))
 
 
 def described(

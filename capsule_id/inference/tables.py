@@ -13,7 +13,6 @@ from capsule_id.inference.checks.posterior import runs_alone
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
 from capsule_id.inference.curvature import covariance
 from capsule_id.inference.least_squares import linearised, rows_of
-from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target import LogPosterior
@@ -80,7 +79,7 @@ def smoothing_certificate(target: LogPosterior, fit: PointFit) -> ResultTable:
 
 def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing | None) -> tuple[np.ndarray, np.ndarray]:
     """Change of u, (d_located,), if this fit used the engine of ``widths`` (None: exact), by one step; and the sd of u."""
-    own, jacobian = linearised(target, fit.u, fit.u[target.located])
+    own, jacobian = linearised(target, fit.u)
     normal = jacobian.T @ jacobian
     step = -np.linalg.solve(normal, jacobian.T @ (_residuals(_by_engine(target, widths), fit) - own))
     return step, np.sqrt(np.diag(np.linalg.inv(normal)))
@@ -270,7 +269,8 @@ def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, fl
     posterior counts the degrees of freedom that the located parameters take: the trace of the table's hat matrix.
     """
     located, theta, end = target.located, target.theta(fit.u), 0
-    jacobian, x = residual_jacobian(target, fit.u)[:, located], np.linspace(-REACH, REACH, NODES)
+    # A copy: arrays of JAX cannot be changed.
+    jacobian, x = linearised(target, fit.u)[1].copy(), np.linspace(-REACH, REACH, NODES)
     hat = np.sum(np.linalg.qr(jacobian)[0] ** 2, axis=1)
     for e in target.experiments:
         own = e.local(target.mapping(theta))

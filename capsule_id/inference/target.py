@@ -235,6 +235,8 @@ def _check_leaves(experiment: Experiment) -> None:
 # of theta + log |d theta / du|. All densities are natural and normalised; linear nuisances are integrated out.
 
 
+#: An evaluation takes long above this ``LogPosterior.work``, in readings.
+HEAVY = 30_000
 #: Largest dispersion of starts that come from a prior alone, natural-log units.
 WIDEST_START = 0.3
 
@@ -402,39 +404,42 @@ class LogPosterior(eqx.Module):
     # -- densities and residuals --------------------------------------------------------------------------------------
 
     def residuals(self, u: Any) -> Any:
-        """Residuals (n,) of all experiments and priors: the least-squares part of -log posterior."""
+        """Residuals (n,) of all experiments, in their order, and priors: the least-squares part of -log posterior."""
         values = self.constrain(u)
         parts = [jax.vmap(self._residuals_of)(group.experiments, group.local(values)) for group in self.groups]
-        return jnp.concatenate([*(jnp.ravel(part) for part in parts), self.priors.residuals(u, values)])
+        return jnp.concatenate([self._in_order(parts), self.priors.residuals(u, values)])
 
     def linearised(self, u: Any) -> tuple[Any, Any]:
         """Residuals (n,) as in ``residuals``, and their Jacobian (n, l) with respect to the l located entries of u."""
         values, located = self.constrain(u), self.located
         rates: Any = jnp.where(self.positive, values, 1.0)
-        parts = [group.linearised(self._residuals_of, values, rates, located) for group in self.groups]
+        pairs = [group.linearised(self._residuals_of, values, rates, located) for group in self.groups]
+        found, jacobians = (self._in_order(parts) for parts in zip(*pairs, strict=True))
         slopes = jnp.diag(jnp.where(self.priors.lognormal, 1.0, rates) / self.priors.width)[:, located]
-        residuals = [*(jnp.ravel(part) for part, _ in parts), self.priors.residuals(u, values)]
-        return jnp.concatenate(residuals), jnp.concatenate([*(j.reshape(-1, len(located)) for _, j in parts), slopes])
+        return jnp.concatenate([found, self.priors.residuals(u, values)]), jnp.concatenate([jacobians, slopes])
+
+    def _in_order(self, parts: Sequence[Any]) -> Any:
+        """Rows (n, ...) in the order of the experiments, from those of every group (members, m, ...)."""
+        rows: dict[int, np.ndarray] = {}
+        end = 0
+        for group, part in zip(self.groups, parts, strict=True):
+            for member in group.members:
+                rows[member], end = np.arange(end, end + part.shape[1]), end + part.shape[1]
+        joined = jnp.concatenate([part.reshape(-1, *part.shape[2:]) for part in parts])
+        return joined[np.concatenate([rows[i] for i in range(len(rows))])]
 
     def _residuals_of(self, experiment: Experiment, theta: ValuesBySymbol) -> Any:
         return experiment.residuals({**theta, **self.constants})
 
-    def residual_owners(self, u: np.ndarray, plain: bool = False) -> list[Experiment | None]:
-        """(n,) experiment of every entry of ``residuals``, or of ``plain_residuals``, at u (d,); None: a prior."""
-        values, order = self.mapping(self.theta(u)), [i for group in self.groups for i in group.members]
-        ordered = self.experiments if plain else [self.experiments[i] for i in order]
-        owners = [e for e in ordered for _ in range(np.size(e.residuals(e.local(values), np)))]
+    def residual_owners(self, u: np.ndarray) -> list[Experiment | None]:
+        """(n,) experiment of every entry of ``residuals`` at u (d,); None: a prior."""
+        values = self.mapping(self.theta(u))
+        owners = [e for e in self.experiments for _ in range(np.size(e.residuals(e.local(values), np)))]
         return [*owners, *[None] * self.dimension]
 
     def prior_residuals(self, u: np.ndarray) -> np.ndarray:
         """(d,) (value - centre)/width: half their sum of squares is the parameter-dependent part of -log prior."""
         return self.priors.at(slice(None), np).residuals(u, self.theta(u), np)
-
-    def plain_residuals(self, u: np.ndarray) -> np.ndarray:
-        """Residuals as in ``residuals``, by NumPy without compilation, in the order of the experiments."""
-        values = self.mapping(self.theta(u))
-        parts = [np.asarray(e.residuals(e.local(values), np)) for e in self.experiments]
-        return np.concatenate([*parts, self.prior_residuals(u)])
 
     @property
     def work(self) -> int:

@@ -18,6 +18,7 @@ from capsule_id.records.motion import measured_motion
 from capsule_id.rig.model import Quantity, Rig
 from tests.experiments import bench
 from tests.forced_runs import table, theta
+from tests.inference.stub import plain_residuals
 from tests.measured.folders import Entry, make_rig, quantity
 from tests.scipy_general import simulate_general
 
@@ -72,7 +73,7 @@ def estimate(shaken: Rig) -> tuple[dict[str, float], dict[str, float]]:
     def residuals(v: np.ndarray) -> np.ndarray:
         u = u0.copy()
         u[own] = v
-        return target.plain_residuals(u)
+        return plain_residuals(target, u)
 
     away = u0[own] + np.where(target.positive[own], 0.1, 1e-4)
     found = least_squares(residuals, away, x_scale="jac", diff_step=1e-6)

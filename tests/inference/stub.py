@@ -1,6 +1,7 @@
 """Targets without readings: experiments that name parameters only, and known densities to sample from."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol
 from capsule_id.experiments.misfit import Misfit
+from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.target import LogPosterior, Scale
 from capsule_id.parameters import Parameter, Prior
@@ -35,6 +37,19 @@ def log_posterior(target: LogPosterior, u: np.ndarray) -> np.ndarray:
 
 def rig_without_tables(priors: Mapping[str, Prior] | None = None) -> Rig:
     return Rig("bench", True, None, None, Quantity(9.81), priors or {}, (), {}, Path("bench"))
+
+
+def plain_residuals(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """Residuals (n,) as ``LogPosterior.residuals`` has them at u (d,), by NumPy without compilation."""
+    values = target.mapping(target.theta(u))
+    parts = [np.asarray(e.residuals(e.local(values), np)) for e in target.experiments]
+    return np.concatenate([*parts, target.prior_residuals(u)])
+
+
+def plain_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(n, located) Jacobian of ``plain_residuals`` by central differences."""
+    step = 1e-5 * np.where(target.positive, 1.0, target.prior_sd)
+    return jacobian(partial(plain_residuals, target), u, step)[:, target.located]
 
 
 class Nothing(Experiment):

@@ -9,7 +9,6 @@ from scipy.optimize import least_squares
 from capsule_id.experiments.forced_run.drives import BaseRun
 from capsule_id.experiments.friction_model import FrictionModel
 from capsule_id.inference.checks.verdict import record_widenings
-from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
@@ -17,6 +16,7 @@ from capsule_id.records.motion import measured_motion
 from capsule_id.records.periods import Repeat, find_period
 from capsule_id.records.tones import fit_harmonic
 from capsule_id.views import Finding
+from tests.inference.stub import plain_jacobian, plain_residuals
 from tests.measured.folders import Entry, make_rig, quantity
 from tests.measured.sources import frame
 
@@ -69,7 +69,7 @@ def fitted(folder: Path) -> SampledFit:
         def residuals(v: np.ndarray, u: np.ndarray = u) -> np.ndarray:
             moved = u.copy()
             moved[located] = v
-            return target.plain_residuals(moved)
+            return plain_residuals(target, moved)
 
         u[located] = least_squares(residuals, u[located], x_scale="jac", diff_step=1e-6, max_nfev=25).x
         values = target.mapping(target.theta(u))
@@ -89,7 +89,7 @@ def test_the_stiffness_of_the_frame_is_within_its_widened_interval(tmp_path: Pat
     """
     found = fitted(tmp_path)
     index = [found.target.names[i] for i in found.target.located].index("k1")
-    jacobian = residual_jacobian(found.target, found.fit.u)[:, found.target.located]
+    jacobian = plain_jacobian(found.target, found.fit.u)
     sd = found.values["k1"] * float(np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[index, index]))
     wide = record_widenings(found)["k1"]
     assert wide.factor > 3.0

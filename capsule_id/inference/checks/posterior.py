@@ -44,7 +44,7 @@ class RunsAlone:
 def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
     """Estimate from runs and priors: one Gauss–Newton step from the joint ``fit`` without bench residuals."""
     located = target.located
-    misses, jacobian = linearised(target, fit.u, fit.u[located])
+    misses, jacobian = linearised(target, fit.u)
     rows = np.array([owner is None or not owner.bench for owner in target.residual_owners(fit.u)])
     kept = jacobian[rows]
     covariance = np.linalg.inv(kept.T @ kept)

@@ -9,7 +9,7 @@ from scipy import optimize, stats
 from capsule_id.experiments.base import Experiment, ValuesBySymbol, autocorrelation, estimate, refit
 from capsule_id.experiments.friction import varies
 from capsule_id.inference.curvature import jacobian
-from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.parameters import INSTRUMENT_ERRORS, is_stated
 from capsule_id.views import Facts, Finding
@@ -266,8 +266,9 @@ def check_settings(s: SampledFit) -> list[Finding]:
 
     A parameter is not judged where an error of more than ``LARGEST_UNSEEN`` sd may go unseen.
     """
-    residuals, end, findings = s.target.plain_residuals(s.fit.u), 0, []
-    keep, effects = np.ones(len(residuals), dtype=bool), dict[tuple[str, str], np.ndarray]()
+    end, findings = 0, []
+    keep = np.ones(len(s.target.residual_owners(s.fit.u)), dtype=bool)
+    effects = dict[tuple[str, str], np.ndarray]()
     for e in s.experiments:
         theta = e.local(s.values)
         rows, end = np.arange(end, end + e.n), end + len(e.residuals(theta, np))
@@ -276,10 +277,10 @@ def check_settings(s: SampledFit) -> list[Finding]:
             effect = effects.setdefault((setting, e.label * (setting == "loads")), np.full(len(keep), np.nan))
             effect[rows] = raw / e.misfit(theta).sd
     varied = {key: effect[keep] for key, effect in effects.items() if np.nansum(np.abs(effect)) > 0.0}
-    jacobian = residual_jacobian(s.target, s.fit.u)[keep][:, s.target.located] if varied else np.zeros((0, 0))
     physical = {row.name for row in s.target.parameters if row.physical and not is_stated(row.name)}
+    residuals, jacobian = (part[keep] for part in linearised(s.target, s.fit.u)) if varied else (keep, keep)
     for (setting, label), effect in varied.items():
-        p, errors = added_effect(residuals[keep], jacobian, effect)
+        p, errors = added_effect(residuals, jacobian, effect)
         pairs = zip(np.array(s.target.names)[s.target.located].tolist(), errors.tolist(), strict=True)
         unseen = {name: error for name, error in pairs if name in physical and error > LEAST_SHIFT}
         facts = {"rows": int(np.sum(~np.isnan(effect))), "unseen": unseen, "p": p}

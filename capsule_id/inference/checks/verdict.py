@@ -22,7 +22,7 @@ from capsule_id.inference.checks.posterior import (
     in_doubt,
 )
 from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, judged, outliers
-from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.point_stage import PHASES, SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import LENGTH_IN_TAU, MAX_RHAT
@@ -389,8 +389,9 @@ def record_widenings(s: SampledFit) -> dict[str, Widening]:
     if not any(e.cycles is not None for e in records):
         return {}
     # Stated values are no estimates from the parts: ``beside_stated`` adds their share of the sd.
-    located = np.array([i for i in s.target.located if not is_stated(s.target.names[i])])
-    jacobian, residuals = residual_jacobian(s.target, s.fit.u)[:, located], s.target.plain_residuals(s.fit.u)
+    estimated = np.array([not is_stated(s.target.names[i]) for i in s.target.located])
+    (residuals, jacobian), located = linearised(s.target, s.fit.u), s.target.located[estimated]
+    jacobian = jacobian[:, estimated]
     informed = {row.name for e in records for row in e.parameters if row.physical}
     found: dict[str, Widening] = {}
     for division in (by_time, by_phase):
@@ -421,7 +422,7 @@ def by_phase(record: Experiment) -> Int[np.ndarray, " n"] | None:
 
 
 def parts_of_residuals(s: SampledFit, records: Sequence[Experiment], division: Division) -> Int[np.ndarray, " m"]:
-    """Part of each of ``LogPosterior.plain_residuals``; -1, one more part, for other experiments; ``PRIORS`` for priors."""
+    """Part of each of ``LogPosterior.residuals``; -1, one more part, for other experiments; ``PRIORS`` for priors."""
     parts, used = [], 0
     for e in s.experiments:
         own = np.full(len(e.residuals(e.local(s.values), np)), -1)

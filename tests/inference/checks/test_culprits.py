@@ -20,6 +20,7 @@ from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 from tests import forced_runs
 from tests.experiments import bench
+from tests.inference.stub import plain_residuals
 
 TRUTH = forced_runs.TRUTH
 RUN = 0
@@ -69,7 +70,7 @@ def estimate(target: LogPosterior) -> tuple[np.ndarray, np.ndarray]:
     def residuals(v: np.ndarray) -> np.ndarray:
         moved = u.copy()
         moved[target.located] = v
-        return target.plain_residuals(moved)
+        return plain_residuals(target, moved)
 
     found = least_squares(residuals, u[target.located], x_scale="jac", diff_step=1e-6, max_nfev=20)
     return found.x, np.linalg.inv(found.jac.T @ found.jac)

@@ -21,13 +21,13 @@ from capsule_id.inference.checks.verdict import (
     steps_of_parts,
     widening,
 )
-from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.experiments import test_base_run as shaken
+from tests.inference.stub import plain_jacobian
 
 NO_ARRAY = np.zeros(0)
 
@@ -57,7 +57,7 @@ def pulls(s: SampledFit, misfit: float, divisions: tuple = (by_time, by_phase)) 
     """
     rng, located = np.random.default_rng(0), s.target.located
     run, k = s.experiments[0], [s.target.names[i] for i in located].index("k1")
-    jacobian = residual_jacobian(s.target, s.fit.u)[:, located]
+    jacobian = plain_jacobian(s.target, s.fit.u)
     parts = [parts_of_residuals(s, [run], division) for division in divisions]  # type: ignore[list-item]
     inverse = np.linalg.pinv(jacobian)
     sd = float(np.linalg.norm(inverse[k]))
@@ -115,7 +115,7 @@ def test_parts_are_whole_periods_and_phases(known: SampledFit) -> None:
 def test_the_rows_of_the_priors_are_no_part(known: SampledFit) -> None:
     run, dimension = cast(BaseRun, known.experiments[0]), known.target.dimension
     part = parts_of_residuals(known, [run], by_time)
-    assert len(part) == len(residual_jacobian(known.target, known.fit.u))
+    assert len(part) == len(known.target.residual_owners(known.fit.u))
     assert np.all(part[-dimension:] == PRIORS)
     assert np.all(part[:-dimension] != PRIORS)
 
@@ -160,7 +160,7 @@ def errors_of_decays(misfit: float) -> tuple[np.ndarray, np.ndarray]:
     s, rng = dry_decay(), np.random.default_rng(0)
     run, located = cast(FreeVibration, s.experiments[0]), s.target.located
     k = [s.target.names[i] for i in located].index("F_dry")
-    jacobian = residual_jacobian(s.target, s.fit.u)[:, located]
+    jacobian = plain_jacobian(s.target, s.fit.u)
     part, inverse = parts_of_residuals(s, [run], by_time), np.linalg.pinv(jacobian)
     half, envelope = (2.0 * run.cycles).astype(int), np.exp(-run.cycles / 6.0)
     sd, plain, widened = float(np.linalg.norm(inverse[k])), [], []

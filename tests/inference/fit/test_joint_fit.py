@@ -116,13 +116,13 @@ def test_where_motions_have_kinks_candidates_descend_before_they_are_chosen(
     target = LogPosterior(rig, make_experiments(rig))
     lag, seen, risen = np.array(target.names) == "lag", list[float](), (1, 2, 20)
 
-    def descend(_: LogPosterior, u: np.ndarray, most: int) -> Any:
+    def descended(_: LogPosterior, u: np.ndarray, most: int) -> Any:
         assert most == joint_starts.FIRST_STEPS
         seen.append(float(u[lag][0]))
         reached = float(len(seen)) if len(seen) in risen else -100.0
         return SimpleNamespace(x=np.where(lag, reached, u)[target.located][None])
 
-    monkeypatch.setattr(joint_starts.difference_descent, "descend", descend)
+    monkeypatch.setattr(joint_starts, "descended", descended)
     monkeypatch.setattr(joint_starts, "weigh", lambda _, u: u[:, lag][:, 0])
     starts = choose_starts(target, {}, 0, {})
     assert len(seen) >= 2 * joint_starts.CONTENDERS
