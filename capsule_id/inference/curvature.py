@@ -69,31 +69,47 @@ STEP, RATIO = 0.05, 2.0
 FEWEST_UNITS = 1e3
 
 
-def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector) -> Matrix:
-    """(d, d) Hessian of a log-density ((m, d) -> (m,)) at u (d,); ``scale`` (d,) is a rough sd of each parameter.
+def directions(d: int, alone: np.ndarray) -> Points:
+    """Steps of differences, a row each: along every coordinate but those ``alone``, and along all of these at once."""
+    rest = np.setdiff1d(np.arange(d), alone)
+    together = np.sum(np.eye(d)[alone], axis=0, keepdims=True)
+    return np.concatenate([np.eye(d)[rest], together]) if len(alone) else np.eye(d)
+
+
+def hessian(terms: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector, alone: np.ndarray) -> Matrix:
+    """(d, d) Hessian of a log-density at u (d,); ``scale`` (d,) is a rough sd of each parameter.
 
     Beside the end of its domain, such as critical damping, the density has no difference quotient. The curvature of
     ``scale`` stands there.
+
+    Parameters
+    ----------
+    terms : (m, d) -> (m, 1 + a), of which the density is the sum: one without the a coordinates ``alone``, then of each
     """
     d = len(u)
-    rows, columns = np.triu_indices(d)
-    unit = np.diag(scale)
+    rest, unit = np.setdiff1d(np.arange(d), alone), directions(d, alone) * scale
+    rows, columns = np.triu_indices(len(unit))
     pair, single = unit[rows] + unit[columns], unit[rows] - unit[columns]
-    estimates, beyond = [], np.zeros(len(rows), dtype=bool)
+    estimates, beyond = [], np.zeros((len(rows), 1 + len(alone)), dtype=bool)
     for step in (STEP, RATIO * STEP):
         offsets = step * np.concatenate([pair, -pair, single, -single])
-        values = in_batches(function, np.concatenate([u + offsets, u[None]]))
-        plus, minus, cross, cross_minus = np.split(values[:-1], 4)
-        parts = np.stack([plus, minus, cross, cross_minus])
+        values = in_batches(terms, np.concatenate([u + offsets, u[None]]))
+        parts = np.stack(np.split(values[:-1], 4))
         # Beyond the domain the density is -inf; a NaN is a defect, and stays.
         beyond |= np.any(np.isneginf(parts), axis=0)
         plus, minus, cross, cross_minus = np.where(np.isneginf(parts), 0.0, parts)
         estimates.append((plus + minus - cross - cross_minus) / (4.0 * step**2))
     best = (RATIO**2 * estimates[0] - estimates[1]) / (RATIO**2 - 1.0)
-    best = np.where(beyond, np.where(rows == columns, -1.0, 0.0), best)
-    matrix = np.zeros((d, d))
-    matrix[rows, columns] = best / (scale[rows] * scale[columns])
-    return matrix + np.triu(matrix, 1).T
+    usual = np.where(rows == columns, -1.0, 0.0)
+    sums = np.where(np.any(beyond, axis=1), usual, np.sum(best, axis=1))
+    # Two directions stand for one entry, or, with all coordinates alone, for one of each of these.
+    one, matrix = columns < len(rest), np.zeros((d, d))
+    matrix[rest[rows[one]], rest[columns[one]]] = sums[one]
+    if len(alone):
+        each = np.where(beyond, usual[:, None], best)[~one, 1:]
+        matrix[rest[:, None], alone], matrix[alone, alone] = each[:-1], each[-1]
+    matrix /= np.outer(scale, scale)
+    return np.where(np.eye(d, dtype=bool), matrix, matrix + matrix.T)
 
 
 def jacobian(function: Callable[[np.ndarray], np.ndarray], u: Vector, step: Vector) -> Float[np.ndarray, "n d"]:

@@ -390,7 +390,13 @@ def trials_of(target: LogPosterior) -> list[Progression]:
 
 
 def density_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the log-posterior of ``target``, scatters not integrated out: u (w, d) -> (w,), -inf where not finite.
+    """Return the log-posterior of ``target``, scatters not integrated out: u (w, d) -> (w,), -inf where not finite."""
+    terms = terms_of(target)
+    return lambda u: np.sum(terms(u), axis=1)
+
+
+def terms_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the terms of ``density_of``, u (w, d) -> (w, 1 + scatters): without the integrated scatters, and of each.
 
     It is the sampler's program with every scatter at its first node, so that the fit compiles no program of its own.
     """
@@ -398,13 +404,13 @@ def density_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:
     located, scatter = np.array(layout.located), np.array(layout.scatter, dtype=int)
     straight = np.full(len(scatter), -np.inf)
 
-    def density(u: np.ndarray) -> np.ndarray:
+    def terms(u: np.ndarray) -> np.ndarray:
         start = u[:, scatter]
-        known, terms, _ = conditional(layout, target, u[:, located], start, np.ones(start.shape), straight)
-        total = np.sum(np.asarray(known), axis=1) + np.sum(np.asarray(terms)[:, :, 0], axis=1)
-        return np.where(np.isfinite(total), total, -np.inf)
+        known, of_nodes, _ = conditional(layout, target, u[:, located], start, np.ones(start.shape), straight)
+        found = np.concatenate([np.sum(known, axis=1, keepdims=True), np.asarray(of_nodes)[:, :, 0]], axis=1)
+        return np.where(np.isfinite(found), found, -np.inf)
 
-    return density
+    return terms
 
 
 def _layout(target: LogPosterior) -> Layout:

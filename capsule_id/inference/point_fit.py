@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -13,9 +13,9 @@ from scipy.linalg import solve_triangular
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import Experiment
-from capsule_id.inference.curvature import Jacobian, covariance, hessian
+from capsule_id.inference.curvature import Jacobian, Matrix, Vector, covariance, directions, hessian
 from capsule_id.inference.least_squares import Solver, least_squares, linearised
-from capsule_id.inference.marginal import density_of
+from capsule_id.inference.marginal import density_of, terms_of
 from capsule_id.inference.result import STATED, PointFit
 from capsule_id.inference.target import LogPosterior, prior_of
 from capsule_id.parameters import is_stated
@@ -115,7 +115,7 @@ def point_fit(
     starts, u, value, converged = (each[kept] for each in (starts, u, value, converged))
     best = int(np.searchsorted(kept, best))
     _, at_fit = linearised(target, u[best])
-    root = _root_of_covariance(target, u[best], at_fit)
+    root = np.matmul(*_root_of_covariance(target, u[best], at_fit))
     spread = np.sqrt(np.sum(root**2, axis=1))
     return described(
         target,
@@ -145,21 +145,21 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     before, after = in_batches(density, starts), in_batches(density, ends)
     ends = np.where((after >= before)[:, None], ends, starts)
     best = int(np.argmax(np.nan_to_num(np.fmax(before, after), nan=-np.inf)))
-    whitening = _root_of_covariance(target, ends[best], linearised(target, ends[best])[1])
+    roots = _root_of_covariance(target, ends[best], linearised(target, ends[best])[1])
     # Every batch runs in the pool of threads, so the starts need their own.
     with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
         # SciPy hides this warning itself, but its way is not safe in threads.
         warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
-        highest = _polish(density, ends[best], whitening)
+        highest = _polish(target, ends[best], roots)
         if not highest[2]:
             # The best end of least squares may lie far from the maximum, where the curvature is another one.
-            whitening = _root_of_covariance(target, highest[0], linearised(target, highest[0])[1])
-            highest = _polish(density, highest[0], whitening)
+            roots = _root_of_covariance(target, highest[0], linearised(target, highest[0])[1])
+            highest = _polish(target, highest[0], roots)
         # An end of least squares within a fraction of a standard deviation leads to the same maximum.
-        spread = np.sqrt(np.sum(whitening**2, axis=1))
+        spread = np.sqrt(np.sum(np.matmul(*roots) ** 2, axis=1))
         away = np.any(np.abs(ends - highest[0])[:, located] > SAME_BASIN * spread[located], axis=1)
         away[best] = False
-        others = list(threads.map(lambda end: _polish(density, end, whitening), ends[away]))
+        others = list(threads.map(lambda end: _polish(target, end, roots), ends[away]))
     polished = [others.pop(0) if own else highest for own in away]
     u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     return u, value, converged
@@ -178,34 +178,42 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
     return centre + spread * z
 
 
-def _polish(
-    density: Callable[[np.ndarray], np.ndarray], end: np.ndarray, whitening: np.ndarray
-) -> tuple[np.ndarray, float, bool]:
-    """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged."""
+def _polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> tuple[Vector, float, bool]:
+    """BFGS from ``end`` (d,) in coordinates whitened by ``roots``: maximum (d,), log-posterior there, converged.
 
-    def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
-        """Negative log-posterior at whitened v (d,), and its gradient (d,): one batch for both, up to 15 parameters."""
-        offsets = GRADIENT_STEP * np.eye(len(v))
-        value = in_batches(density, end + np.concatenate([v[None], v + offsets, v - offsets]) @ whitening.T)
-        centre, *sides = np.split(-np.where(np.isfinite(value), value, LOG_POSTERIOR_FLOOR), [1, 1 + len(v)])
-        return float(centre[0]), (sides[0] - sides[1]) / (2.0 * GRADIENT_STEP)
+    The differences of its gradient are along the coordinates of the first root alone, whose scatters are still alone.
+    """
+    whitening, rotation = roots
+    alone, d, terms = np.flatnonzero(target.integrated), len(end), terms_of(target)
+    rest, steps = np.setdiff1d(np.arange(d), alone), GRADIENT_STEP * directions(d, alone)
+
+    def objective(v: Vector) -> tuple[float, Vector]:
+        """Negative log-posterior at whitened v (d,), and its gradient (d,): one batch for both, up to 15 directions."""
+        w = rotation @ v
+        found = in_batches(terms, end + np.concatenate([w[None], w + steps, w - steps]) @ whitening.T)
+        found = np.where(np.isfinite(found), found, LOG_POSTERIOR_FLOOR)
+        centre, *sides = np.split(found, [1, 1 + len(steps)])
+        slopes, gradient = (sides[0] - sides[1]) / (2.0 * GRADIENT_STEP), np.empty(d)
+        gradient[rest], gradient[alone] = np.sum(slopes[: len(rest)], axis=1), slopes[len(rest) :, 1:].reshape(-1)
+        return -float(np.sum(centre)), -gradient @ rotation
 
     stop_if_interrupted()
     options = {"gtol": TOLERANCE, "maxiter": MAX_STEPS}
     solution = optimize.minimize(objective, np.zeros(len(end)), jac=True, method="BFGS", options=options)
     value = -float(solution.fun)
     return (
-        end + whitening @ solution.x,
+        end + whitening @ rotation @ solution.x,
         value,
         value > LOG_POSTERIOR_FLOOR and bool(np.max(np.abs(solution.jac)) < MAXIMUM),
     )
 
 
-def _root_of_covariance(target: LogPosterior, u: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """R (d, d) with R R' the inverse Hessian of -log-posterior at u (d,), from the ``jacobian`` (n, located) of the residuals.
+def _root_of_covariance(target: LogPosterior, u: Vector, jacobian: Jacobian) -> tuple[Matrix, Matrix]:
+    """W, T (d, d) with W T (W T)' the inverse Hessian of -log-posterior at u (d,); ``jacobian`` (n, located) of residuals.
 
-    The Hessian is taken in coordinates that are whitened by Gauss-Newton's approximation, by an orthogonal factor. Where
-    the readings determine k1/m1 to six digits and m1 to two, no digit of the Hessian in u itself would be left.
+    The Hessian is taken in coordinates that W whitens by Gauss-Newton's approximation, by an orthogonal factor. Where
+    the readings determine k1/m1 to six digits and m1 to two, no digit of the Hessian in u itself would be left. W mixes no
+    scatter with another parameter.
     """
     located = target.located
     count = np.zeros(target.dimension)
@@ -216,11 +224,11 @@ def _root_of_covariance(target: LogPosterior, u: np.ndarray, jacobian: np.ndarra
     whitening = np.diag(np.maximum(count, 1e-2) ** -0.5)
     triangle = np.linalg.qr(np.nan_to_num(jacobian, posinf=0.0, neginf=0.0), mode="r")
     whitening[np.ix_(located, located)] = solve_triangular(triangle, np.eye(len(located)))
-    density = density_of(target)
-    curvature = hessian(lambda w: density(u + w @ whitening.T), np.zeros(len(u)), np.ones(len(u)))
+    terms, zero = terms_of(target), np.zeros(len(u))
+    curvature = hessian(lambda w: terms(u + w @ whitening.T), zero, zero + 1.0, np.flatnonzero(target.integrated))
     # Away from a maximum a direction may have no positive curvature; there Gauss-Newton's stands.
     values, vectors = np.linalg.eigh(np.nan_to_num(-curvature, nan=0.0, posinf=0.0, neginf=0.0))
-    return whitening @ (vectors / np.sqrt(np.where(values > FLATTEST, values, 1.0)))
+    return whitening, vectors / np.sqrt(np.where(values > FLATTEST, values, 1.0))
 
 
 def described(

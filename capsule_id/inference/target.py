@@ -471,7 +471,7 @@ class LogPosterior(eqx.Module):
     def nested_starts(self) -> np.ndarray:
         """(k, d) u of starts at fits of simpler models of the readings; a parameter without one has its usual start."""
         own = [experiment.nested_starts() for experiment in self.experiments]
-        usual = {name: start.centre for name, start in self.starts().items()}
+        usual = {name: start.centre for name, start in self.starts().items()} if any(own) else {}
         found = []
         for k in range(max(map(len, own), default=0)):
             values = {name: value for starts in own for name, value in (starts[k : k + 1] or [{}])[0].items()}

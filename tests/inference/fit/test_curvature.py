@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.inference.curvature import hessian, jacobian, require_width
+from capsule_id.inference.curvature import directions, hessian, jacobian, require_width
 from capsule_id.physics.batches import BATCH, in_batches
 from capsule_id.precision import require_float64
 
 require_float64()
 SCALE = np.array([1e-4, 2e-2, 1.0, 0.1])
 AT = np.array([3.0, -1.0, 0.5, 2.0])
+NONE = np.zeros(0, dtype=int)
 
 
 def smooth(u: jax.Array) -> jax.Array:
@@ -21,23 +22,42 @@ def smooth(u: jax.Array) -> jax.Array:
     return -0.5 * (v @ v) - 0.8 * v[0] * v[1] - jnp.log1p(jnp.exp(v[2])) - 0.05 * v[3] ** 4
 
 
+def whole(u: np.ndarray) -> np.ndarray:
+    """(m, 1) ``smooth``: a log-density of one term."""
+    return np.asarray(jax.vmap(smooth)(u))[:, None]
+
+
 def test_hessian_against_automatic_differentiation() -> None:
-    found = hessian(jax.vmap(smooth), AT, SCALE)
+    found = hessian(whole, AT, SCALE, NONE)
     scale = np.outer(SCALE, SCALE)
     np.testing.assert_allclose(found * scale, jax.hessian(smooth)(AT) * scale, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(found, found.T)
+
+
+def of_terms(u: jax.Array) -> jax.Array:
+    """A term of the coordinates 1 and 3, and one of 2 and of 0 with these."""
+    v = (u - jnp.asarray(AT)) / jnp.asarray(SCALE)
+    shared = v[1] + 0.3 * v[3]
+    return jnp.stack([-(shared**2) - jnp.cosh(v[3]), -jnp.exp(v[2] - shared) - v[2] ** 2, -(v[0] ** 4) - v[0] * v[1]])
+
+
+def test_coordinates_of_one_term_share_their_differences() -> None:
+    found = hessian(lambda u: np.asarray(jax.vmap(of_terms)(u)), AT, SCALE, np.array([2, 0]))
+    scale = np.outer(SCALE, SCALE)
+    expected = jax.hessian(lambda u: jnp.sum(of_terms(u)))(AT)
+    np.testing.assert_allclose(found * scale, expected * scale, rtol=1e-5, atol=1e-5)
+    assert len(directions(500, np.arange(3, 500))) == 4
 
 
 def test_the_hessian_beside_the_end_of_the_domain() -> None:
     """A decay near critical damping: the density ends at a step from the maximum (before: eigenvalues failed)."""
 
     def ending(u: np.ndarray) -> np.ndarray:
-        values = np.asarray(jax.vmap(smooth)(u))
-        return np.where(u[:, 1] > AT[1] + 1e-9, -np.inf, values)
+        return np.where(u[:, 1:2] > AT[1] + 1e-9, -np.inf, whole(u))
 
-    found, whole = hessian(ending, AT, SCALE), hessian(jax.vmap(smooth), AT, SCALE)
+    found, everywhere = hessian(ending, AT, SCALE, NONE), hessian(whole, AT, SCALE, NONE)
     inside = np.ix_([0, 2, 3], [0, 2, 3])
-    np.testing.assert_allclose(found[inside], whole[inside])
+    np.testing.assert_allclose(found[inside], everywhere[inside])
     assert found[1, 1] == -1.0 / SCALE[1] ** 2
     assert np.isfinite(found).all()
 
@@ -46,9 +66,9 @@ def test_a_density_that_is_no_number_shows() -> None:
     """Only -inf is the end of a domain."""
 
     def defective(u: np.ndarray) -> np.ndarray:
-        return np.where(u[:, 1] > AT[1] + 1e-9, np.nan, np.asarray(jax.vmap(smooth)(u)))
+        return np.where(u[:, 1:2] > AT[1] + 1e-9, np.nan, whole(u))
 
-    found = hessian(defective, AT, SCALE)
+    found = hessian(defective, AT, SCALE, NONE)
     assert np.isnan(found[1]).all()
     assert np.isfinite(found[np.ix_([0, 2, 3], [0, 2, 3])]).all()
 

@@ -15,7 +15,7 @@ from capsule_id.api import read_rig
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.curvature import hessian
-from capsule_id.inference.marginal import HEAVY, MarginalPosterior, conditional, density_of, uniform_at
+from capsule_id.inference.marginal import HEAVY, MarginalPosterior, conditional, density_of, terms_of, uniform_at
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
@@ -91,7 +91,9 @@ def approximate(target: LogPosterior, known: dict[str, float]) -> PointFit:
     u = target.unconstrain(np.array([known[name] for name in target.names]))
     scale = np.full(target.dimension, 1e-3)
     for _ in range(3):
-        root = np.linalg.cholesky(np.linalg.inv(-hessian(density_of(target), u, scale)))
+        root = np.linalg.cholesky(
+            np.linalg.inv(-hessian(terms_of(target), u, scale, np.flatnonzero(target.integrated)))
+        )
         scale = np.sqrt(np.sum(root**2, axis=1))
     none = np.zeros((1, target.dimension))
     return PointFit(target.names, u, {}, root @ root.T, {}, none, none, np.zeros(1), *np.zeros((2, 1), dtype=bool))
