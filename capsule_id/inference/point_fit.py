@@ -199,7 +199,9 @@ def _polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> 
 
     stop_if_interrupted()
     options = {"gtol": TOLERANCE, "maxiter": MAX_STEPS}
-    solution = optimize.minimize(objective, np.zeros(len(end)), jac=True, method="BFGS", options=options)
+    # A line search may leave the domain, where slopes of the floor overflow.
+    with np.errstate(over="ignore", invalid="ignore"):
+        solution = optimize.minimize(objective, np.zeros(d), jac=True, method="BFGS", options=options)
     value = -float(solution.fun)
     return (
         end + whitening @ rotation @ solution.x,
