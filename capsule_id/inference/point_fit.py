@@ -85,7 +85,7 @@ TOLERANCE, MAXIMUM = 1e-4, 1e-3
 GRADIENT_STEP = 2e-2
 #: Largest number of quasi-Newton steps.
 MAX_STEPS = 400
-#: Replaces a log-posterior that is not finite, because line searches need a finite number.
+#: Replaces a term of the log-posterior that is not finite, because line searches need a finite number.
 LOG_POSTERIOR_FLOOR = -1e12
 #: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
 #: until the prior stops it. Quasi-Newton reaches that point in fewer steps.
@@ -203,11 +203,9 @@ def _polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> 
     with np.errstate(over="ignore", invalid="ignore"):
         solution = optimize.minimize(objective, np.zeros(d), jac=True, method="BFGS", options=options)
     value = -float(solution.fun)
-    return (
-        end + whitening @ rotation @ solution.x,
-        value,
-        value > LOG_POSTERIOR_FLOOR and bool(np.max(np.abs(solution.jac)) < MAXIMUM),
-    )
+    # Beside a term at the floor the others may be positive.
+    inside = value > 0.5 * LOG_POSTERIOR_FLOOR
+    return end + whitening @ rotation @ solution.x, value, inside and bool(np.max(np.abs(solution.jac)) < MAXIMUM)
 
 
 def _root_of_covariance(target: LogPosterior, u: Vector, jacobian: Jacobian) -> tuple[Matrix, Matrix]:
