@@ -418,8 +418,17 @@ def correlated_records(experiments: Sequence["Experiment"], values: Mapping[str,
 # further columns: What columns explain of residuals beside those that the fitted parameters can take up.
 
 
-#: Directions of further columns that are shorter than this, relative to the longest one, are combinations of the others.
+#: Directions of columns that are shorter than this, relative to the longest one, are combinations of the others.
 COMBINATION = 1e-8
+
+
+def basis_of(columns: np.ndarray) -> np.ndarray:
+    """(n, rank) orthonormal columns with the span of ``columns`` (n, p).
+
+    Columns of nuisances may span those of parameters, as discrepancies do that all trials of a setting share.
+    """
+    u, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, size > COMBINATION * np.max(size, initial=0.0)]
 
 
 def further_columns(known: np.ndarray, further: np.ndarray, left: np.ndarray) -> tuple[float, float, np.ndarray]:
@@ -431,8 +440,7 @@ def further_columns(known: np.ndarray, further: np.ndarray, left: np.ndarray) ->
     length. What the known columns take up is projected out of both. Columns that are combinations of others count once.
     """
     own, columns = without(known, left, further)
-    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    basis = basis[:, sizes > COMBINATION * sizes[0]]
+    basis = basis_of(columns)
     effects = columns.T @ own / np.maximum(np.linalg.norm(columns, axis=0), COMBINATION)
     rank, freedom = basis.shape[1], len(own) - np.count_nonzero(known.any(axis=0)) - basis.shape[1]
     if freedom < rank:
@@ -447,6 +455,42 @@ def without(known: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
     size = np.linalg.norm(known, axis=0)
     basis = np.linalg.qr(known[:, size > 0.0] / size[size > 0.0])[0]
     return [part - basis @ (basis.T @ part) for part in parts]
+
+
+# judgement: p-values of random orders, and findings of one check of several experiments.
+
+
+#: Statistics that differ by less, relative to the size of the one found, are equal but for rounding.
+TIE = 1e-9
+
+
+def permutation_p(values: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], number: int) -> float:
+    """Probability that a random order of ``values`` (n,) has as large a ``statistic`` (...), of orders (..., n).
+
+    The ``number`` of orders are the same ones each time.
+    """
+    orders = np.random.default_rng(0).permuted(np.tile(values, (number, 1)), axis=1)
+    found = statistic(values)
+    return float((1 + np.sum(statistic(orders) >= found - TIE * np.abs(found))) / (1 + number))
+
+
+def of_neighbours(values: np.ndarray) -> np.ndarray:
+    """Sum of the products of neighbours, (...) of (..., n): large where neighbours have one sign."""
+    return np.sum(values[..., 1:] * values[..., :-1], axis=-1)
+
+
+def judged(
+    code: str, cases: Sequence[tuple[str, float, Facts]], level: float, number: Facts | None = None
+) -> list[Finding]:
+    """Findings of one check of several experiments with this family-wise false-alarm rate (Bonferroni); [] without any.
+
+    Parameters
+    ----------
+    cases : label of the experiment, p-value and facts
+    number : facts of the finding where no case fails
+    """
+    failed = [Finding(code, "fail", facts, label) for label, p, facts in cases if p * len(cases) < level]
+    return failed or [Finding(code, "ok", number or {})] * bool(cases)
 
 
 # refit: Estimates from one experiment alone, with or without some of its readings.

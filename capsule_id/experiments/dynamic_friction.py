@@ -12,6 +12,7 @@ from capsule_id.experiments.friction import (
     CAPTIONS,
     MASSES_OF_FREE,
     MESSAGES,
+    SCATTER_OF_MU,
     FrictionExperiment,
     SurfaceSettings,
     check_scatter,
@@ -23,7 +24,7 @@ from capsule_id.experiments.friction import (
 )
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors
-from capsule_id.parameters import INSTRUMENT_ERRORS, Prior, scatter
+from capsule_id.parameters import INSTRUMENT_ERRORS, scatter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.forces import FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
@@ -67,7 +68,7 @@ LINT_MESSAGES = {
 
 
 PUSH_SCATTER = scatter(
-    "push_scatter", "1", "relative scatter of mu from push to push", r"s_\mathrm{push}", Prior("halfnormal", 0.0, 0.05)
+    "push_scatter", "1", "relative scatter of mu from push to push", r"s_\mathrm{push}", SCATTER_OF_MU
 )
 #: Pushes of the twin: speeds, m/s; reading errors, m/s and m; relative scatter of mu.
 SPEEDS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])

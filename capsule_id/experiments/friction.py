@@ -17,7 +17,7 @@ from capsule_id.experiments.friction_variants import check_variants
 from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.experiments.point_test import FRICTION, PointTest
-from capsule_id.parameters import Parameter
+from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
@@ -42,6 +42,8 @@ class PullSettings(SurfaceSettings):
     load_is: Literal["weight", "pressed"] | None = None
 
 
+#: Prior of the relative scatter of mu from trial to trial.
+SCATTER_OF_MU = Prior("halfnormal", 0.0, 0.05)
 #: Column of the normal force of every trial, where it differs from trial to trial.
 NORMAL_FORCE_COLUMN = ColumnRule("N", POSITIVE)
 
@@ -97,7 +99,7 @@ def masses_of_pulls(table: Table[Any]) -> tuple[str, ...]:
 
 def lint_slides(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where slides have few rows: constant friction has one unknown, another law mu and v_s."""
-    return lint_rows(table, rig, 3 if rig.model.friction == "constant" else 5)
+    return lint_rows(table, rig, 1 if rig.model.friction == "constant" else 2)
 
 
 CAPTIONS = {

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from capsule_id.experiments.base import LEVEL
+from capsule_id.experiments.base import LEVEL, of_neighbours, permutation_p
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI
@@ -49,7 +49,7 @@ class Variant:
     log_likelihood : the largest of the sample
     evidence : log marginal likelihood
     bic : Schwarz's criterion
-    lack_of_fit : p-value of the residuals' order, see ``order_p``
+    lack_of_fit : p-value of the residuals' order in speed: neighbours of one sign show a curve that misses the readings
     """
 
     model: FrictionModel
@@ -170,7 +170,7 @@ def fit_variant(points: VariantPoints, model: FrictionModel, seed: int) -> Varia
         float(values[best]),
         evidence,
         len(rows) * float(np.log(points.n)) - 2.0 * float(values[best]),
-        order_p((np.sqrt(points.number) * raw / sd)[0][order], np.random.default_rng(seed)),
+        permutation_p((np.sqrt(points.number) * raw / sd)[0][order], of_neighbours, PERMUTATIONS),
     )
 
 
@@ -199,19 +199,6 @@ def sequential_monte_carlo(
             accepted = np.log(rng.random(PARTICLES)) < change
             z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
     return z, value, evidence
-
-
-def order_p(residuals: np.ndarray, rng: np.random.Generator) -> float:
-    """Permutation p-value of the sum of products of neighbouring residuals (n,), in the order of speed.
-
-    Neighbours of one sign show a curve that misses the readings. The test is exact for exchangeable residuals.
-    """
-
-    def statistic(r: np.ndarray) -> np.ndarray:
-        return np.sum(r[..., 1:] * r[..., :-1], axis=-1)
-
-    shuffled = rng.permuted(np.tile(residuals, (PERMUTATIONS, 1)), axis=1)
-    return float((1 + np.sum(statistic(shuffled) >= statistic(residuals))) / (1 + PERMUTATIONS))
 
 
 def _next_step(value: np.ndarray, largest: float) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.experiments.lint import lint_channel, lint_smooth, lint_times
+from capsule_id.experiments.lint import USUAL, lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, drive_power, phasor
 from capsule_id.records.tones import recorded_drive, stated_Omega
@@ -502,7 +502,7 @@ KIND = Kind(
         "time": ColumnRule("s", increasing=True),
         "x_rel": ColumnRule("m", varies=True),
         # A capsule that never moves is a valid result, so its displacement has no smallest size.
-        "x_capsule": ColumnRule("m", usual=(0.0, 0.9)),
+        "x_capsule": ColumnRule("m", usual=(0.0, USUAL["m"][1])),
         "acceleration_rod": ColumnRule("m/s^2", varies=True),
         "current": ColumnRule("A", varies=True),
         "x_base": ColumnRule("m", varies=True),

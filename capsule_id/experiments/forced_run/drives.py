@@ -20,6 +20,7 @@ from capsule_id.experiments.base import (
     axis_label,
     band,
     further_columns,
+    judged,
     stretch,
 )
 from capsule_id.experiments.capsule_experiment import lag_of
@@ -203,20 +204,13 @@ FEWEST_PERIODS = 4
 
 def check_repeated(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
     """Check that the residuals of no record repeat with the excitation."""
-    tests = [
-        (run, label, *found)
+    cases = [
+        (run.label, found[1], {"record": label, "F": found[0], "p": found[1], **run.noise_facts()})
         for run in runs
         for label, residuals in run.records(run.local(fit.values))
         if (found := repetition(run, residuals)) is not None
     ]
-    findings = [
-        Finding("runs.repeated", "fail", {"record": label, "F": F, "p": p, **run.noise_facts()}, run.label)
-        for run, label, F, p in tests
-        if p * len(tests) < LEVEL
-    ]
-    if findings or not tests:
-        return findings
-    return [Finding("runs.repeated", "ok", {"p": min(p for *_, p in tests)})]
+    return judged("runs.repeated", cases, LEVEL, {"p": min((p for _, p, _ in cases), default=1.0)})
 
 
 def repetition(run: CapsuleRun, residuals: Float[np.ndarray, " n"]) -> tuple[float, float] | None:

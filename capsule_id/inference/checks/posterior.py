@@ -1,6 +1,5 @@
 """Checks of the sampled posterior: agreement of experiments, modes, priors, predictions."""
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,9 +10,9 @@ from scipy import stats
 from scipy.fft import dct
 from scipy.ndimage import gaussian_filter1d
 
-from capsule_id.experiments.base import LEVEL, Experiment
-from capsule_id.experiments.lint import WRONG_PREFIX
-from capsule_id.inference.checks.settings import SMALLEST_SCATTER, basis_of, design
+from capsule_id.experiments.base import LEVEL, TIE, Experiment, basis_of
+from capsule_id.experiments.lint import wrong_prefix
+from capsule_id.inference.checks.settings import SMALLEST_SCATTER, design
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.moves import geyer_size
 from capsule_id.inference.point_stage import SampledFit
@@ -28,6 +27,8 @@ from capsule_id.views import Finding
 
 #: Family-wise false-alarm rate of the comparison between bench tests and runs, dimensionless.
 AGREEMENT_LEVEL = 0.02
+#: Part of a sample in each of the tails, where Student's t continues it.
+TAIL = 0.005
 #: Degrees of freedom of the tails without a sample: those of three trials, the fewest that show their own scatter.
 FREEDOM_WITHOUT_SAMPLE = 2
 
@@ -90,16 +91,16 @@ def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
 
     Beyond the outermost 1 % a Student t tail, fitted to the outer quantiles, extrapolates the sample.
     """
-    below = np.mean(draws < value)
-    if 0.005 < below < 0.995:
+    below, centre = np.mean(draws < value), float(np.median(draws))
+    if TAIL < below < 1.0 - TAIL:
         return float(-stats.norm.ppf(below))
     # The outer quantiles at two levels give the number of degrees of freedom of the tail.
-    levels = np.array([0.005, 0.05]) if below < 0.5 else np.array([0.995, 0.95])
-    centre = float(np.median(draws))
-    outer, inner = np.abs(np.quantile(draws, levels) - centre)
+    levels = np.array([TAIL, 10.0 * TAIL])
+    outer, inner = np.abs(np.quantile(draws, levels if value < centre else 1.0 - levels) - centre)
     grid = np.geomspace(1.0, 1e3, 200)
-    freedom = float(grid[np.argmin(np.abs(stats.t.isf(0.005, grid) / stats.t.isf(0.05, grid) - outer / inner))])
-    scale = outer / stats.t.isf(0.005, freedom)
+    ratio = np.divide(*stats.t.isf(levels[:, None], grid))
+    freedom = float(grid[np.argmin(np.abs(ratio - outer / inner))])
+    scale = outer / stats.t.isf(TAIL, freedom)
     tail = stats.t.logsf(abs(value - centre) / scale, freedom)
     # z with the same log(1 - Phi(z)), also where the tail itself underflows.
     z = np.linspace(0.0, 40.0, 8001)
@@ -355,11 +356,7 @@ def _finding(s: SampledFit, row: Parameter, conflict: Mapping[str, float], p: fl
     name = row.name
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
     prior = prior_of(row)
-    unit = (
-        name in s.rig.priors
-        and prior.kind == "lognormal"
-        and abs(abs(math.log10(conflict["value"] / prior.median)) - 3.0) < WRONG_PREFIX
-    )
+    unit = name in s.rig.priors and prior.kind == "lognormal" and wrong_prefix(conflict["value"] / prior.median)
     facts = {
         "name": name,
         "key": "" if is_stated(name) or unit or name in in_doubt(s) else row.prior_key,
@@ -426,10 +423,9 @@ def p_values(residuals: np.ndarray, columns: np.ndarray) -> dict[str, float]:
     for name, statistic in STATISTICS.items():
         scale = spread if name == "largest" else 1.0
         here, there = statistic(seen / scale)[0], statistic(drawn / scale)
-        equal = np.abs(there - here) <= 1e-9 * max(1.0, abs(here))
-        found[name] = float(
-            (0.5 + np.sum(there > here + 1e-9) + 0.5 * np.sum(equal & (there <= here + 1e-9))) / (1 + number)
-        )
+        tie = TIE * max(1.0, abs(here))
+        larger, equal = np.sum(there > here + tie), np.sum(np.abs(there - here) <= tie)
+        found[name] = float((0.5 + larger + 0.5 * equal) / (1 + number))
     return found
 
 

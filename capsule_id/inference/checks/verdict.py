@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy import stats
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import LAGS, LEVEL, Experiment, correlated_records, estimate, refit
+from capsule_id.experiments.base import LAGS, LEVEL, Experiment, correlated_records, estimate, judged, refit
 from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.inference.checks.posterior import (
     PRIOR_PULL,
@@ -21,7 +21,7 @@ from capsule_id.inference.checks.posterior import (
     default_scatter,
     in_doubt,
 )
-from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, judged, outliers
+from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, outliers
 from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import PHASES, SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
