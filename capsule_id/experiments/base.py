@@ -333,6 +333,11 @@ def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
     return lower, upper
 
 
+def stacked(draws: Sequence[ValuesBySymbol], axes: int = 0) -> dict[str, np.ndarray]:
+    """Draws of the parameters by symbol, (draws,), with so many further ``axes`` of length 1."""
+    return {name: np.array([draw[name] for draw in draws]).reshape(-1, *(1,) * axes) for name in draws[0]}
+
+
 # clock: The clock of a record: where rig.toml states the sd of its drift, the drift is a parameter of the fit.
 #
 # An error of the drift stretches the record. k1 follows it twice, c once; a record of many excitation periods runs

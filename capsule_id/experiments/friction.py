@@ -207,11 +207,9 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
     start = (float(np.max(coefficient)), float(np.median(speed[sliding])))
     bounds = [0.0, LOWEST_V_S], [np.inf, np.inf]
     found = least_squares(lambda own: unit_law(*own).forward(speed) - coefficient, start, bounds=bounds)
-    if not found.success:
+    if not found.success or found.active_mask[1]:
         return {}
     mu, v_s = found.x
-    if v_s < 1.01 * LOWEST_V_S:
-        return {}
     variance = np.linalg.pinv(found.jac.T @ found.jac)[1, 1] * 2.0 * found.cost / max(len(speed) - 2, 1)
     # Two points determine both values, without a standard error.
     known = v_s <= LARGEST_V_S * np.max(speed) and (len(speed) == 2 or np.sqrt(variance) <= v_s)

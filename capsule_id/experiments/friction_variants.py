@@ -28,8 +28,6 @@ from capsule_id.views import Finding
 FACTOR, TELLING = 100.0, 10.0
 #: Number of groups of readings, neighbours in speed: time and memory do not grow with the readings beyond.
 GROUPS = 128
-#: Coefficients, particles times groups, that are predicted at a time: memory does not grow with the particles.
-MOST_AT_ONCE = 1 << 16
 #: Number of particles, Metropolis steps between two powers, and the part of the particles that a power must keep.
 PARTICLES, MOVES, KEPT = 1000, 6, 0.5
 #: Smallest relative error of a reading: rounding of equal readings.
@@ -136,13 +134,9 @@ class VariantPoints:
 
     def log_likelihood(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> np.ndarray:
         """(s,) natural log-density of the log-coefficients."""
-        number, step = len(next(iter(theta.values()))), max(1, MOST_AT_ONCE // len(self.speed))
-        values = []
-        for first in range(0, number, step):
-            raw, sd = self.scaled(model, {name: column[first : first + step] for name, column in theta.items()})
-            squares = self.number * (raw / sd) ** 2 + self.spread / sd**2
-            values.append(-0.5 * np.sum(squares + self.number * (LOG_2PI + 2.0 * np.log(sd)), axis=1))
-        value = np.concatenate(values)
+        raw, sd = self.scaled(model, theta)
+        squares = self.number * (raw / sd) ** 2 + self.spread / sd**2
+        value = -0.5 * np.sum(squares + self.number * (LOG_2PI + 2.0 * np.log(sd)), axis=1)
         return np.where(np.isfinite(value), value, -np.inf)
 
 

@@ -21,6 +21,7 @@ from capsule_id.experiments.base import (
     band,
     further_columns,
     judged,
+    stacked,
     stretch,
 )
 from capsule_id.experiments.capsule_experiment import lag_of
@@ -276,7 +277,7 @@ def _motion_row(run: CapsuleRun, fit: Fitted) -> dict[str, object]:
     """Motion of one record: its label, contacts, and mean velocities with the band of a new record."""
     best, seen = run.motion(run.local(fit.values), np), measured_motion(run.table)
     local = [run.local(draw) for draw in fit.draws[:BAND_DRAWS]]
-    sample = run.motion(_stacked(local), np) if local else None
+    sample = run.motion(stacked(local), np) if local else None
     evidence, found = seen.evidence, seen.evidence.mean_velocity
     period = evidence.repeat.period if evidence.repeat else None
 
@@ -297,11 +298,6 @@ def _motion_row(run: CapsuleRun, fit: Fitted) -> dict[str, object]:
     if found is not None:
         row["mean velocity, record, mm/s"] = f"{1e3 * found.velocity:.4g} ± {sd:.2g}"
     return row
-
-
-def _stacked(draws: Sequence[ValuesBySymbol]) -> dict[str, np.ndarray]:
-    """(draws,) values by symbol."""
-    return {name: np.array([draw[name] for draw in draws]) for name in draws[0]}
 
 
 # panels: Plot data of a forced run: every channel with its residuals, and the phase portrait.
@@ -358,7 +354,7 @@ class OtherRun(CapsuleRun):
 
         ``theta`` is the point fit. Bands use at most ``BAND_DRAWS`` of ``draws`` and exclude the noise.
         """
-        bands = self.predict(_stacked(draws[:BAND_DRAWS]), np) if draws else [None] * len(self.channels)
+        bands = self.predict(stacked(draws[:BAND_DRAWS]), np) if draws else [None] * len(self.channels)
         panels = []
         for channel, part, seen, drawn in zip(
             self.channels, self.scaled(theta, np), self.predict(theta, np), bands, strict=False

@@ -134,9 +134,8 @@ def changes_of_second_half(e: DecayRecord, theta: ValuesBySymbol) -> dict[str, t
     found = [_estimates(half, theta) for half in _halves(e)]
     if not found:
         return {}
-    (first, first_sd), (second, second_sd) = found
-    sd = {name: np.hypot(first_sd[name], second_sd[name]) for name in first}
-    return {name: (first[name], second[name], float((second[name] - first[name]) / sd[name]), True) for name in first}
+    pairs = {name: (*found[0][name], *found[1][name]) for name in found[0]}
+    return {name: (a, b, float((b - a) / np.hypot(sd_a, sd_b)), True) for name, (a, sd_a, b, sd_b) in pairs.items()}
 
 
 def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
@@ -285,15 +284,13 @@ def _halves(e: DecayRecord) -> list[DecayRecord]:
     return [e.with_model(e.model, table=table) for table in tables]
 
 
-def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
-    """Estimates and standard errors of the physical parameters from one half, from the values ``theta`` of the whole."""
+def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Estimate and standard error of each physical parameter from one half, from the values ``theta`` of the whole."""
     if half.closed and not half.model.whitened:
-        pairs = refit(half, theta, [])
-        return {name: v for name, (v, _) in pairs.items()}, {name: sd for name, (_, sd) in pairs.items()}
+        return refit(half, theta, [])
     screening = Screening(half, k1=theta["k1"])
     found, _ = screening.fit(half.model, screening.scaled(theta))
-    names = ("k1", "c", *half.model.symbols)
-    return {name: found.values[name] for name in names}, {name: found.errors[name] for name in names}
+    return {name: (found.values[name], found.errors[name]) for name in ("k1", "c", *half.model.symbols)}
 
 
 check_halves = halves(changes_of_second_half)

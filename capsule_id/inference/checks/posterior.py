@@ -33,24 +33,19 @@ TAIL = 0.005
 FREEDOM_WITHOUT_SAMPLE = 2
 
 
-@dataclass(frozen=True)
-class RunsAlone:
-    """Estimate from runs and priors only: ``names`` of the located parameters, u (p,), covariance (p, p)."""
+def runs_alone(target: LogPosterior, fit: PointFit) -> dict[str, tuple[float, float]]:
+    """Estimate from runs and priors: one Gauss–Newton step from the joint ``fit`` without bench residuals.
 
-    names: tuple[str, ...]
-    u: np.ndarray
-    covariance: np.ndarray
-
-
-def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
-    """Estimate from runs and priors: one Gauss–Newton step from the joint ``fit`` without bench residuals."""
+    Return u and its sd of every located parameter, by name.
+    """
     located = target.located
     misses, jacobian = linearised(target, fit.u, fit.u[located])
     rows = np.array([owner is None or not owner.bench for owner in target.residual_owners(fit.u)])
     kept = jacobian[rows]
     covariance = np.linalg.inv(kept.T @ kept)
     u = fit.u[located] - covariance @ (kept.T @ misses[rows])
-    return RunsAlone(tuple(target.names[i] for i in located), u, covariance)
+    pairs = zip(u.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)
+    return dict(zip((target.names[i] for i in located), pairs, strict=True))
 
 
 @dataclass(frozen=True)
@@ -69,19 +64,18 @@ class Distance:
 
 
 def disagreement(
-    shared: Sequence[str], runs: RunsAlone, bench: PointFit, sample: Posterior | None
+    shared: Sequence[str], runs: Mapping[str, tuple[float, float]], bench: PointFit, sample: Posterior | None
 ) -> dict[str, Distance]:
-    """Return the distance of every ``shared`` parameter, by name; bench and runs are independent."""
+    """Return the distance of every ``shared`` parameter, by name; bench and ``runs``, u and its sd, are independent."""
     found = {}
     for name in shared:
-        i, j = runs.names.index(name), bench.names.index(name)
-        own = runs.covariance[i, i]
-        z = sd = float((bench.u[j] - runs.u[i]) / np.sqrt(bench.covariance[j, j] + own))
+        (u, own), j = runs[name], bench.names.index(name)
+        z = sd = float((bench.u[j] - u) / np.sqrt(bench.covariance[j, j] + own**2))
         if sample is not None:
             # Every shared parameter is positive: u is its logarithm.
             draws = np.log(sample.draws[..., j].ravel())
-            blurred = draws + np.sqrt(own) * np.random.default_rng(j).standard_normal(draws.size)
-            z = _by_sample(blurred, float(runs.u[i]), sd)
+            blurred = draws + own * np.random.default_rng(j).standard_normal(draws.size)
+            z = _by_sample(blurred, u, sd)
         found[name] = Distance(sd, z)
     return found
 
