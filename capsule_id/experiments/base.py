@@ -462,6 +462,13 @@ def without(known: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
     return [part - basis @ (basis.T @ part) for part in parts]
 
 
+def weighted_mean(values: Sequence[float], sds: Sequence[float]) -> tuple[float, float, float]:
+    """Mean of independent estimates, weighted by their standard errors; its standard error; and chi-square about it."""
+    value, weight = np.asarray(values), np.asarray(sds) ** -2.0
+    mean = np.average(value, weights=weight)
+    return float(mean), float(np.sum(weight) ** -0.5), float(np.sum(weight * (value - mean) ** 2))
+
+
 # judgement: p-values of random orders, and findings of one check of several experiments.
 
 

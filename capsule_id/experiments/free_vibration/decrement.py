@@ -31,7 +31,7 @@ PEAK_RANGE_RATIO, PEAK_RANGE_RATIO_OF_JUMPS = 0.005, 0.05
 #: A record still swings where its range, or its distance from rest, exceeds this fraction of the whole record's range.
 SWINGING_RATIO = 0.05
 #: Grid of the search for a viscous decay: frequencies from this many rad over the record on, their number, and that of
-#: those near the peak of the spectrum; damping ratios; and number of its best points that are refined.
+#: those near the peak of the spectrum; damping ratios; and number of the best points of a search that are refined.
 SLOWEST, WIDE_POINTS, NEAR_POINTS, REFINED = 0.3, 48, 9, 3
 RATIOS = np.geomspace(0.001, 3.0, 12)
 #: Limits of the damping ratio of the search, and largest one whose decrement is quoted as a rough value.

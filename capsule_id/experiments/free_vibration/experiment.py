@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, further_columns, refit
+from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, further_columns, refit, weighted_mean
 from capsule_id.experiments.context import Check, Fitted
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (
@@ -79,13 +79,10 @@ def check_stiffness(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding
     """Check that k1 of single records does not depend on amplitude (the paper's "linear near the working point")."""
     if len(records) < 2:
         return []
-    estimates = [refit(e, e.local(fit.values), [])["k1"] for e in records]
-    k1, sd = (np.array(column) for column in zip(*estimates, strict=True))
-    weight = sd**-2.0
-    mean = np.average(k1, weights=weight)
-    q = float(np.sum(weight * (k1 - mean) ** 2))
+    k1, sd = zip(*(refit(e, e.local(fit.values), [])["k1"] for e in records), strict=True)
+    q = weighted_mean(k1, sd)[2]
     p = float(stats.chi2.sf(q, len(records) - 1))
-    facts = {"records": len(records), "low": k1.min(), "high": k1.max(), "chi_square": q, "p": p}
+    facts = {"records": len(records), "low": min(k1), "high": max(k1), "chi_square": q, "p": p}
     return [Finding("decays.stiffness", "fail" if p < LEVEL else "ok", facts)]
 
 

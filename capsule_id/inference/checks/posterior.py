@@ -380,8 +380,6 @@ MOST_REPLICATES, FEWEST_REPLICATES, REPLICATED_READINGS = 4000, 1000, 4_000_000
 MOST_READINGS = 5000
 #: Fewest residual degrees of freedom that can be judged.
 FEWEST_FREE = 6
-#: Probability that clean data give a finding of an experiment. The smallest p-value is half of one replicate.
-PREDICTIVE_LEVEL = 0.002
 #: Number of the slowest cosines that the trend counts.
 SLOWEST = 3
 
@@ -444,6 +442,7 @@ def experiment_p_values(e: Experiment, theta: Mapping[str, float]) -> dict[str, 
 def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding]:
     """Compare runs of signs, largest residual and trend of every bench test with replicates.
 
+    ``LEVEL`` is the probability that clean data give a finding of one test; the smallest p-value is half of one replicate.
     Tests with outliers, and the ``known`` ones, whose trials are known not to be alike, are left out: their residuals
     have a named cause.
     """
@@ -453,7 +452,7 @@ def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding
             continue
         found = experiment_p_values(e, e.local(s.values))
         judged += bool(found)
-        small = {name: p for name, p in found.items() if p * len(found) < PREDICTIVE_LEVEL}
+        small = {name: p for name, p in found.items() if p * len(found) < LEVEL}
         # One large residual hardly moves a record's fit, and tables have their own check of outliers.
         worst = min(small, key=lambda name: (name == "largest", small[name]), default=None)
         if worst is not None:
