@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,13 +13,13 @@ from scipy import stats
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
-from capsule_id.experiments.context import Check, RunRecord, TableMaker
 from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.parameters import Parameter, Prior, is_stated, parameter
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.precision import require_float64
+from capsule_id.records.view import RunRecord
 from capsule_id.rig.model import NO_DRIFT, Column, Rig, Table
-from capsule_id.views import Comparison, Facts, Finding
+from capsule_id.views import Comparison, Facts, Finding, ResultTable
 
 # base: Base class of experiments: their interface to inference and to the report.
 #
@@ -40,6 +40,61 @@ BLOCKS, MOST_TERMS = 60, 1000
 #: Parameter values and constants of one experiment, SI, by *symbol* (``k1``, ``k2``, ``noise_sd``, ``g``, ``m1``).
 #: ``Experiment.local`` makes it from values by name (``k2[soft]``, ``noise_sd[decay_1]``).
 ValuesBySymbol = Mapping[str, Any]
+
+
+# context: Interface between a fit and the checks and tables of an experiment.
+
+
+@dataclass(frozen=True)
+class Tension:
+    """Likelihood-ratio test that two groups of experiments share their parameters.
+
+    Attributes
+    ----------
+    p : p-value of twice the increase of the log-posterior where each group has its own parameters, from chi-square with 1
+        degree of freedom
+    one, other : estimates from each group alone, SI, by name
+    """
+
+    p: float
+    one: Mapping[str, float]
+    other: Mapping[str, float]
+
+
+class Fitted(Protocol):
+    """A finished fit.
+
+    Attributes
+    ----------
+    values : the point fit and the constants, SI, by name
+    flagged : row indices of the outliers, by label
+    draws : posterior draws, SI, by name; [] without a sample
+    """
+
+    @property
+    def values(self) -> Mapping[str, float]: ...
+
+    @property
+    def flagged(self) -> Mapping[str, Sequence[int]]: ...
+
+    @property
+    def draws(self) -> Sequence[Mapping[str, float]]: ...
+
+    def tension(self, one: Sequence[Any], other: Sequence[Any]) -> Tension:
+        """Likelihood-ratio test that two groups of experiments share their parameters."""
+        ...
+
+    def correlation(self, names: Sequence[str]) -> np.ndarray:
+        """(n, n) correlations of parameters, of the draws or, without a sample, at the maximum."""
+        ...
+
+
+#: A check maps the experiments that declare it, and the fit, to findings; a table function maps them to tables.
+Check = Callable[[Sequence[Any], Fitted], list[Finding]]
+TableMaker = Callable[[Sequence[Any], Fitted], list[ResultTable]]
+
+
+# experiment: Its data beside the likelihood, and its methods.
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, band
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import LEVEL, Fitted, Start, ValuesBySymbol, band
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, has_stated_load
 from capsule_id.experiments.friction_variants import check_variants
 from capsule_id.experiments.kind import Values

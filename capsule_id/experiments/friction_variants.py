@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from capsule_id.experiments.base import LEVEL, of_neighbours, permutation_p
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import LEVEL, Fitted, of_neighbours, permutation_p
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior

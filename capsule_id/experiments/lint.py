@@ -238,24 +238,12 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
             findings += [Finding(code, "warn", facts, table.label)] * bool(rows)
         for lint_table in kinds[table.kind].lint:
             findings += lint_table(table, rig)
-    return (*with_line(findings, rig), *_same_files(rig, tables), *_repeated_blocks(rig, tables))
+    return (*with_line(findings, rig), *_repeated(rig, tables))
 
 
 def lint_settings(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> tuple[Finding, ...]:
     """Return findings on settings at rough values, before anything is fitted."""
     return tuple(found for table in rig.tables for found in kinds[table.kind].lint_rig(table, rig, estimate))
-
-
-def _same_files(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
-    """Report tables whose files have the same bytes."""
-    by_content: dict[tuple[object, ...], list[Table[Any]]] = {}
-    for table in tables:
-        if table.file in rig.files:
-            by_content.setdefault(_content(rig, table), []).append(table)
-    for first, *others in by_content.values():
-        for other in others:
-            facts = {"file": other.file, "first": first.label, "rows": list(range(len(other.rows)))}
-            yield Finding("readings.repeated_file", "fail", facts, other.label)
 
 
 def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
@@ -265,11 +253,20 @@ def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
     return rig.files.get(table.file, table.label), *readings
 
 
-def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
-    """Report rows that occur twice, within a table or across tables with the same columns; equal files are left out."""
+def _repeated(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
+    """Report tables with the same readings of files with the same bytes, then other rows that occur twice.
+
+    These may stand within a table or in tables with the same columns.
+    """
+    by_content: dict[tuple[object, ...], list[Table[Any]]] = {}
     groups: dict[tuple[str, ...], list[Table[Any]]] = {}
-    for table in {_content(rig, table): table for table in reversed(tables)}.values():
-        groups.setdefault(tuple(sorted(set(table.columns) - {"time"})), []).insert(0, table)
+    for table in tables:
+        by_content.setdefault(_content(rig, table), []).append(table)
+    for first, *others in by_content.values():
+        groups.setdefault(tuple(sorted(set(first.columns) - {"time"})), []).append(first)
+        for other in others:
+            facts = {"file": other.file, "first": first.label, "rows": list(range(len(other.rows)))}
+            yield Finding("readings.repeated_file", "fail", facts, other.label)
     for names, members in groups.items():
         by_label = {table.label: table for table in members}
         readings = [

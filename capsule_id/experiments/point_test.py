@@ -21,6 +21,7 @@ from scipy import stats
 from capsule_id.experiments.base import (
     LEVEL,
     About,
+    Fitted,
     Start,
     ValuesBySymbol,
     axis_label,
@@ -28,7 +29,6 @@ from capsule_id.experiments.base import (
     refit,
     scatter_prior,
 )
-from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
     FrictionModel,

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import (
     LEVEL,
+    Fitted,
     Start,
     ValuesBySymbol,
     autocorrelation,
@@ -25,7 +26,6 @@ from capsule_id.experiments.base import (
     stretch,
 )
 from capsule_id.experiments.capsule_experiment import lag_of
-from capsule_id.experiments.context import Fitted, RunRecord
 from capsule_id.experiments.forced_run.declaration import FEWEST_SAMPLES, SETTLING_PERIODS
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
@@ -44,7 +44,7 @@ from capsule_id.physics.model import (
 )
 from capsule_id.records.motion import fit_mean_velocity, measured_motion
 from capsule_id.records.tones import relative_position, stated_gap, stated_Omega, tone_at
-from capsule_id.records.view import FILTER_ORDER, view_record
+from capsule_id.records.view import FILTER_ORDER, RunRecord, view_record
 from capsule_id.rig.filters import choose_window, median_step, sampling_step, savitzky_golay, window_samples
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTable

@@ -9,8 +9,16 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, further_columns, refit, weighted_mean
-from capsule_id.experiments.context import Check, Fitted
+from capsule_id.experiments.base import (
+    LEVEL,
+    Check,
+    Fitted,
+    Start,
+    ValuesBySymbol,
+    further_columns,
+    refit,
+    weighted_mean,
+)
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,

@@ -8,8 +8,7 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lsim
 
-from capsule_id.experiments.base import ValuesBySymbol, stretch, without
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import Fitted, ValuesBySymbol, stretch, without
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,

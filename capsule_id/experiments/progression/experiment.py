@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments.base import About, Start, ValuesBySymbol, band, stacked
+from capsule_id.experiments.base import About, Fitted, Start, ValuesBySymbol, band, stacked
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters
-from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, ground_parameters
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.progression.declaration import (

@@ -19,7 +19,7 @@ from capsule_id.experiments.base import (
 )
 from capsule_id.experiments.friction import varies
 from capsule_id.inference.curvature import jacobian
-from capsule_id.inference.point_fit import DIFFERENCE, residual_jacobian
+from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.parameters import INSTRUMENT_ERRORS, is_stated
 from capsule_id.views import Facts, Finding
@@ -31,6 +31,8 @@ from capsule_id.views import Facts, Finding
 # each reading (Cook & Weisberg 1982, section 2.2).
 
 
+#: Relative step of difference quotients, dimensionless.
+DIFFERENCE = 1e-5
 #: Largest number of flagged rows per experiment. More outliers indicate a wrong model, not wrong rows.
 MOST_FLAGGED = 3
 
@@ -150,7 +152,7 @@ def check_order(s: SampledFit, by_load: Collection[str] = ()) -> list[Finding]:
         if s.flagged.get(e.label):
             residuals = residuals - columns @ np.linalg.lstsq(columns, residuals, rcond=None)[0]
         if e.label in by_load:
-            residuals = _within_loads(residuals, _unflagged(s, e, e.loads)[0])
+            residuals = _within_loads(residuals, _loads(s, e)[0])
         if len(residuals) >= FEWEST_ROWS and np.std(residuals) > SMALLEST_SCATTER:
             correlation, p = lag_1(residuals)
             factor = float(np.sqrt((1.0 + correlation) / (1.0 - correlation)))
@@ -297,7 +299,7 @@ def _of_loads(s: SampledFit, e: Experiment, p: float) -> Facts:
 
     The others are permutation tests of the scatter between loads, and of the correlation with the logarithm of the load.
     """
-    residuals, (load, coefficient) = _unflagged(s, e)[0], _unflagged(s, e, e.loads)
+    residuals, (load, coefficient) = _unflagged(s, e)[0], _loads(s, e)
     means = [(float(one), float(np.mean(coefficient[load == one]))) for one in np.unique(load)]
     if len(residuals) >= FEWEST_ROWS:
         levels = _of_levels([residuals[load == one] for one in np.unique(load)])
@@ -342,6 +344,12 @@ def _standardised(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
         return residuals
     sd = np.array([np.std(residuals[groups == k], ddof=1) for k in range(np.max(groups) + 1)])
     return residuals / np.maximum(sd, SMALLEST_SCATTER)[groups]
+
+
+def _loads(s: SampledFit, e: Experiment) -> list[np.ndarray]:
+    """Load, N, and coefficient of every row without the flagged ones."""
+    assert e.loads is not None, "the table has loads"
+    return _unflagged(s, e, e.loads)
 
 
 def _unflagged(s: SampledFit, e: Experiment, parts: Sequence[np.ndarray] | None = None) -> list[np.ndarray]:
