@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,13 +13,13 @@ from scipy import stats
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
-from capsule_id.experiments.context import Check, RunRecord, TableMaker
 from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.parameters import Parameter, Prior, is_stated, parameter
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.precision import require_float64
+from capsule_id.records.view import RunRecord
 from capsule_id.rig.model import NO_DRIFT, Column, Rig, Table
-from capsule_id.views import Comparison, Facts, Finding
+from capsule_id.views import Comparison, Facts, Finding, ResultTable
 
 # base: Base class of experiments: their interface to inference and to the report.
 #
@@ -40,6 +40,61 @@ BLOCKS, MOST_TERMS = 60, 1000
 #: Parameter values and constants of one experiment, SI, by *symbol* (``k1``, ``k2``, ``noise_sd``, ``g``, ``m1``).
 #: ``Experiment.local`` makes it from values by name (``k2[soft]``, ``noise_sd[decay_1]``).
 ValuesBySymbol = Mapping[str, Any]
+
+
+# context: Interface between a fit and the checks and tables of an experiment.
+
+
+@dataclass(frozen=True)
+class Tension:
+    """Likelihood-ratio test that two groups of experiments share their parameters.
+
+    Attributes
+    ----------
+    p : p-value of twice the increase of the log-posterior where each group has its own parameters, from chi-square with 1
+        degree of freedom
+    one, other : estimates from each group alone, SI, by name
+    """
+
+    p: float
+    one: Mapping[str, float]
+    other: Mapping[str, float]
+
+
+class Fitted(Protocol):
+    """A finished fit.
+
+    Attributes
+    ----------
+    values : the point fit and the constants, SI, by name
+    flagged : row indices of the outliers, by label
+    draws : posterior draws, SI, by name; [] without a sample
+    """
+
+    @property
+    def values(self) -> Mapping[str, float]: ...
+
+    @property
+    def flagged(self) -> Mapping[str, Sequence[int]]: ...
+
+    @property
+    def draws(self) -> Sequence[Mapping[str, float]]: ...
+
+    def tension(self, one: Sequence[Any], other: Sequence[Any]) -> Tension:
+        """Likelihood-ratio test that two groups of experiments share their parameters."""
+        ...
+
+    def correlation(self, names: Sequence[str]) -> np.ndarray:
+        """(n, n) correlations of parameters, of the draws or, without a sample, at the maximum."""
+        ...
+
+
+#: A check maps the experiments that declare it, and the fit, to findings; a table function maps them to tables.
+Check = Callable[[Sequence[Any], Fitted], list[Finding]]
+TableMaker = Callable[[Sequence[Any], Fitted], list[ResultTable]]
+
+
+# experiment: Its data beside the likelihood, and its methods.
 
 
 @dataclass(frozen=True)
@@ -333,6 +388,11 @@ def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
     return lower, upper
 
 
+def stacked(draws: Sequence[ValuesBySymbol], axes: int = 0) -> dict[str, np.ndarray]:
+    """Draws of the parameters by symbol, (draws,), with so many further ``axes`` of length 1."""
+    return {name: np.array([draw[name] for draw in draws]).reshape(-1, *(1,) * axes) for name in draws[0]}
+
+
 # clock: The clock of a record: where rig.toml states the sd of its drift, the drift is a parameter of the fit.
 #
 # An error of the drift stretches the record. k1 follows it twice, c once; a record of many excitation periods runs
@@ -418,8 +478,17 @@ def correlated_records(experiments: Sequence["Experiment"], values: Mapping[str,
 # further columns: What columns explain of residuals beside those that the fitted parameters can take up.
 
 
-#: Directions of further columns that are shorter than this, relative to the longest one, are combinations of the others.
+#: Directions of columns that are shorter than this, relative to the longest one, are combinations of the others.
 COMBINATION = 1e-8
+
+
+def basis_of(columns: np.ndarray) -> np.ndarray:
+    """(n, rank) orthonormal columns with the span of ``columns`` (n, p).
+
+    Columns of nuisances may span those of parameters, as discrepancies do that all trials of a setting share.
+    """
+    u, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, size > COMBINATION * np.max(size, initial=0.0)]
 
 
 def further_columns(known: np.ndarray, further: np.ndarray, left: np.ndarray) -> tuple[float, float, np.ndarray]:
@@ -431,8 +500,7 @@ def further_columns(known: np.ndarray, further: np.ndarray, left: np.ndarray) ->
     length. What the known columns take up is projected out of both. Columns that are combinations of others count once.
     """
     own, columns = without(known, left, further)
-    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    basis = basis[:, sizes > COMBINATION * sizes[0]]
+    basis = basis_of(columns)
     effects = columns.T @ own / np.maximum(np.linalg.norm(columns, axis=0), COMBINATION)
     rank, freedom = basis.shape[1], len(own) - np.count_nonzero(known.any(axis=0)) - basis.shape[1]
     if freedom < rank:
@@ -447,6 +515,49 @@ def without(known: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
     size = np.linalg.norm(known, axis=0)
     basis = np.linalg.qr(known[:, size > 0.0] / size[size > 0.0])[0]
     return [part - basis @ (basis.T @ part) for part in parts]
+
+
+def weighted_mean(values: Sequence[float], sds: Sequence[float]) -> tuple[float, float, float]:
+    """Mean of independent estimates, weighted by their standard errors; its standard error; and chi-square about it."""
+    value, weight = np.asarray(values), np.asarray(sds) ** -2.0
+    mean = np.average(value, weights=weight)
+    return float(mean), float(np.sum(weight) ** -0.5), float(np.sum(weight * (value - mean) ** 2))
+
+
+# judgement: p-values of random orders, and findings of one check of several experiments.
+
+
+#: Statistics that differ by less, relative to the size of the one found, are equal but for rounding.
+TIE = 1e-9
+
+
+def permutation_p(values: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], number: int) -> float:
+    """Probability that a random order of ``values`` (n,) has as large a ``statistic`` (...), of orders (..., n).
+
+    The ``number`` of orders are the same ones each time.
+    """
+    orders = np.random.default_rng(0).permuted(np.tile(values, (number, 1)), axis=1)
+    found = statistic(values)
+    return float((1 + np.sum(statistic(orders) >= found - TIE * np.abs(found))) / (1 + number))
+
+
+def of_neighbours(values: np.ndarray) -> np.ndarray:
+    """Sum of the products of neighbours, (...) of (..., n): large where neighbours have one sign."""
+    return np.sum(values[..., 1:] * values[..., :-1], axis=-1)
+
+
+def judged(
+    code: str, cases: Sequence[tuple[str, float, Facts]], level: float, number: Facts | None = None
+) -> list[Finding]:
+    """Findings of one check of several experiments with this family-wise false-alarm rate (Bonferroni); [] without any.
+
+    Parameters
+    ----------
+    cases : label of the experiment, p-value and facts
+    number : facts of the finding where no case fails
+    """
+    failed = [Finding(code, "fail", facts, label) for label, p, facts in cases if p * len(cases) < level]
+    return failed or [Finding(code, "ok", number or {})] * bool(cases)
 
 
 # refit: Estimates from one experiment alone, with or without some of its readings.

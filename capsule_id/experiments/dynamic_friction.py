@@ -1,6 +1,6 @@
 """Pushes: an initial speed and the distance slid, rod locked to the capsule (paper, section 2.2)."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
@@ -12,6 +12,7 @@ from capsule_id.experiments.friction import (
     CAPTIONS,
     MASSES_OF_FREE,
     MESSAGES,
+    SCATTER_OF_MU,
     FrictionExperiment,
     SurfaceSettings,
     check_scatter,
@@ -23,7 +24,7 @@ from capsule_id.experiments.friction import (
 )
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors
-from capsule_id.parameters import INSTRUMENT_ERRORS, Prior, scatter
+from capsule_id.parameters import INSTRUMENT_ERRORS, scatter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.forces import FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
@@ -67,7 +68,7 @@ LINT_MESSAGES = {
 
 
 PUSH_SCATTER = scatter(
-    "push_scatter", "1", "relative scatter of mu from push to push", r"s_\mathrm{push}", Prior("halfnormal", 0.0, 0.05)
+    "push_scatter", "1", "relative scatter of mu from push to push", r"s_\mathrm{push}", SCATTER_OF_MU
 )
 #: Pushes of the twin: speeds, m/s; reading errors, m/s and m; relative scatter of mu.
 SPEEDS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])
@@ -161,15 +162,17 @@ class Track(NamedTuple):
         """Braking force over the normal force, 1: the coefficient of ``friction`` and the weight along the slope."""
         return array_module(friction).maximum(friction + self.along / self.normal, LEAST_BRAKING * friction)
 
-    def distance(self, law: FrictionLaw, speed: Any) -> Any:
-        """Distance, m, of a slide from ``speed`` (n,), m/s, to rest; ``law`` is the friction coefficient."""
-        return self._slide(lambda u: self.braking(law.forward(u)), speed)
+    def distance(self, law: FrictionLaw, speed: Any, change: bool = False) -> Any:
+        """Distance, m, of a slide from ``speed`` (n,), m/s, to rest; ``law`` is the friction coefficient.
 
-    def change(self, law: FrictionLaw, speed: Any) -> Any:
-        """Change of ``distance`` per relative change of mu, m, with the sign changed."""
-        return self._slide(lambda u: self.braking(law.forward(u)) ** 2 / law.forward(u), speed)
+        With ``change`` its change per relative change of mu, with the sign changed.
+        """
 
-    def _slide(self, forward: Callable[[Any], Any], speed: Any) -> Any:
+        def forward(u: Any) -> Any:
+            friction = law.forward(u)
+            braking = self.braking(friction)
+            return braking**2 / friction if change else braking
+
         braked: Any = SimpleNamespace(forward=forward)
         return slide_distance(braked, 1.0 / self.normal, speed)
 
@@ -216,7 +219,7 @@ class DynamicFriction(FrictionExperiment):
         return {"speed": self.as_read(speed / braking, "speed", theta)}
 
     def change(self, theta: ValuesBySymbol) -> Any:
-        return self.track(theta).change(self.coefficient(theta), self.readings["speed"])
+        return self.track(theta).distance(self.coefficient(theta), self.readings["speed"], change=True)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Points by the paper's formula: mu = v^2/(2gd) at the initial speed."""

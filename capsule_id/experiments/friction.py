@@ -10,14 +10,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, band
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import LEVEL, Fitted, Start, ValuesBySymbol, band
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, has_stated_load
 from capsule_id.experiments.friction_variants import check_variants
 from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.experiments.point_test import FRICTION, PointTest
-from capsule_id.parameters import Parameter
+from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
@@ -42,6 +41,8 @@ class PullSettings(SurfaceSettings):
     load_is: Literal["weight", "pressed"] | None = None
 
 
+#: Prior of the relative scatter of mu from trial to trial.
+SCATTER_OF_MU = Prior("halfnormal", 0.0, 0.05)
 #: Column of the normal force of every trial, where it differs from trial to trial.
 NORMAL_FORCE_COLUMN = ColumnRule("N", POSITIVE)
 
@@ -97,7 +98,7 @@ def masses_of_pulls(table: Table[Any]) -> tuple[str, ...]:
 
 def lint_slides(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where slides have few rows: constant friction has one unknown, another law mu and v_s."""
-    return lint_rows(table, rig, 3 if rig.model.friction == "constant" else 5)
+    return lint_rows(table, rig, 1 if rig.model.friction == "constant" else 2)
 
 
 CAPTIONS = {
@@ -205,11 +206,9 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
     start = (float(np.max(coefficient)), float(np.median(speed[sliding])))
     bounds = [0.0, LOWEST_V_S], [np.inf, np.inf]
     found = least_squares(lambda own: unit_law(*own).forward(speed) - coefficient, start, bounds=bounds)
-    if not found.success:
+    if not found.success or found.active_mask[1]:
         return {}
     mu, v_s = found.x
-    if v_s < 1.01 * LOWEST_V_S:
-        return {}
     variance = np.linalg.pinv(found.jac.T @ found.jac)[1, 1] * 2.0 * found.cost / max(len(speed) - 2, 1)
     # Two points determine both values, without a standard error.
     known = v_s <= LARGEST_V_S * np.max(speed) and (len(speed) == 2 or np.sqrt(variance) <= v_s)

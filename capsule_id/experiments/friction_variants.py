@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from capsule_id.experiments.base import LEVEL
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import LEVEL, Fitted, of_neighbours, permutation_p
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior
@@ -28,8 +27,6 @@ from capsule_id.views import Finding
 FACTOR, TELLING = 100.0, 10.0
 #: Number of groups of readings, neighbours in speed: time and memory do not grow with the readings beyond.
 GROUPS = 128
-#: Coefficients, particles times groups, that are predicted at a time: memory does not grow with the particles.
-MOST_AT_ONCE = 1 << 16
 #: Number of particles, Metropolis steps between two powers, and the part of the particles that a power must keep.
 PARTICLES, MOVES, KEPT = 1000, 6, 0.5
 #: Smallest relative error of a reading: rounding of equal readings.
@@ -49,7 +46,7 @@ class Variant:
     log_likelihood : the largest of the sample
     evidence : log marginal likelihood
     bic : Schwarz's criterion
-    lack_of_fit : p-value of the residuals' order, see ``order_p``
+    lack_of_fit : p-value of the residuals' order in speed: neighbours of one sign show a curve that misses the readings
     """
 
     model: FrictionModel
@@ -136,13 +133,9 @@ class VariantPoints:
 
     def log_likelihood(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> np.ndarray:
         """(s,) natural log-density of the log-coefficients."""
-        number, step = len(next(iter(theta.values()))), max(1, MOST_AT_ONCE // len(self.speed))
-        values = []
-        for first in range(0, number, step):
-            raw, sd = self.scaled(model, {name: column[first : first + step] for name, column in theta.items()})
-            squares = self.number * (raw / sd) ** 2 + self.spread / sd**2
-            values.append(-0.5 * np.sum(squares + self.number * (LOG_2PI + 2.0 * np.log(sd)), axis=1))
-        value = np.concatenate(values)
+        raw, sd = self.scaled(model, theta)
+        squares = self.number * (raw / sd) ** 2 + self.spread / sd**2
+        value = -0.5 * np.sum(squares + self.number * (LOG_2PI + 2.0 * np.log(sd)), axis=1)
         return np.where(np.isfinite(value), value, -np.inf)
 
 
@@ -170,7 +163,7 @@ def fit_variant(points: VariantPoints, model: FrictionModel, seed: int) -> Varia
         float(values[best]),
         evidence,
         len(rows) * float(np.log(points.n)) - 2.0 * float(values[best]),
-        order_p((np.sqrt(points.number) * raw / sd)[0][order], np.random.default_rng(seed)),
+        permutation_p((np.sqrt(points.number) * raw / sd)[0][order], of_neighbours, PERMUTATIONS),
     )
 
 
@@ -199,19 +192,6 @@ def sequential_monte_carlo(
             accepted = np.log(rng.random(PARTICLES)) < change
             z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
     return z, value, evidence
-
-
-def order_p(residuals: np.ndarray, rng: np.random.Generator) -> float:
-    """Permutation p-value of the sum of products of neighbouring residuals (n,), in the order of speed.
-
-    Neighbours of one sign show a curve that misses the readings. The test is exact for exchangeable residuals.
-    """
-
-    def statistic(r: np.ndarray) -> np.ndarray:
-        return np.sum(r[..., 1:] * r[..., :-1], axis=-1)
-
-    shuffled = rng.permuted(np.tile(residuals, (PERMUTATIONS, 1)), axis=1)
-    return float((1 + np.sum(statistic(shuffled) >= statistic(residuals))) / (1 + PERMUTATIONS))
 
 
 def _next_step(value: np.ndarray, largest: float) -> float:

@@ -51,10 +51,11 @@ USUAL: Mapping[str, tuple[float, float]] = {
 MASSES, FORCES, STIFFNESSES, GAPS = (0.03, 150.0), (0.02, 100.0), (0.01, 1000.0), (3e-3, 20.0)
 #: Usual m1 of a rig without m2: no relation judges it.
 MASS_ALONE = (8e-3, 12.0)
-#: Usual period of a decay, s, and amplitude of its acceleration, m/s^2, which holds the square of the unit of time.
-PERIODS, ACCELERATIONS = (2e-3, 20.0), (3e-3, 1e4)
-#: Largest distance of a ratio from 1000, in decades, that a wrong prefix explains.
-WRONG_PREFIX = 0.3
+#: Usual period of a decay or a drive, s, and amplitude of the acceleration of a decay, m/s^2, which holds the square of
+#: the unit of time.
+USUAL_PERIODS, ACCELERATIONS = (2e-3, 20.0), (3e-3, 1e4)
+#: Factor of a wrong prefix, such as m for mm, and largest distance of a ratio from it, in decades, that it explains.
+PREFIX, NEAR_PREFIX = 1e3, 0.3
 #: Relations between two columns: their names, the words, the SI unit, the value, its usual interval.
 RELATIONS = (
     (("force", "current"), "force per current", "N/A", lambda x, y: np.ptp(x) / (np.ptp(y) or 1e-30), (0.03, 300.0)),
@@ -132,8 +133,8 @@ def lint_rig_quantities(rig: Rig) -> Iterable[Finding]:
 def lint_magnitudes(tables: Sequence[Table[Any]], kinds: Mapping[str, Kind], rig: Rig) -> Iterable[Finding]:
     """Warn of columns, settings and relations with unusual values."""
     numbers = [number for table in tables for number in _numbers(table, kinds[table.kind], rig)]
-    # A factor of 1000 in shared scales would make these relations unusual, so that they are right in the others too.
-    right = {n.shared for n in numbers if n.usual[1] / 1e3 <= n.value <= n.usual[0] * 1e3}
+    # A wrong prefix in shared scales would make these relations unusual, so that they are right in the others too.
+    right = {n.shared for n in numbers if n.usual[1] / PREFIX <= n.value <= n.usual[0] * PREFIX}
     for number in numbers:
         shared = () if number.shared in right else number.shared
         yield from replace(number, scales=(*number.scales, *shared)).unusual(rig)
@@ -237,24 +238,12 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
             findings += [Finding(code, "warn", facts, table.label)] * bool(rows)
         for lint_table in kinds[table.kind].lint:
             findings += lint_table(table, rig)
-    return (*with_line(findings, rig), *_same_files(rig, tables), *_repeated_blocks(rig, tables))
+    return (*with_line(findings, rig), *_repeated(rig, tables))
 
 
 def lint_settings(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> tuple[Finding, ...]:
     """Return findings on settings at rough values, before anything is fitted."""
     return tuple(found for table in rig.tables for found in kinds[table.kind].lint_rig(table, rig, estimate))
-
-
-def _same_files(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
-    """Report tables whose files have the same bytes."""
-    by_content: dict[tuple[object, ...], list[Table[Any]]] = {}
-    for table in tables:
-        if table.file in rig.files:
-            by_content.setdefault(_content(rig, table), []).append(table)
-    for first, *others in by_content.values():
-        for other in others:
-            facts = {"file": other.file, "first": first.label, "rows": list(range(len(other.rows)))}
-            yield Finding("readings.repeated_file", "fail", facts, other.label)
 
 
 def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
@@ -264,11 +253,20 @@ def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
     return rig.files.get(table.file, table.label), *readings
 
 
-def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
-    """Report rows that occur twice, within a table or across tables with the same columns; equal files are left out."""
+def _repeated(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
+    """Report tables with the same readings of files with the same bytes, then other rows that occur twice.
+
+    These may stand within a table or in tables with the same columns.
+    """
+    by_content: dict[tuple[object, ...], list[Table[Any]]] = {}
     groups: dict[tuple[str, ...], list[Table[Any]]] = {}
-    for table in {_content(rig, table): table for table in reversed(tables)}.values():
-        groups.setdefault(tuple(sorted(set(table.columns) - {"time"})), []).insert(0, table)
+    for table in tables:
+        by_content.setdefault(_content(rig, table), []).append(table)
+    for first, *others in by_content.values():
+        groups.setdefault(tuple(sorted(set(first.columns) - {"time"})), []).append(first)
+        for other in others:
+            facts = {"file": other.file, "first": first.label, "rows": list(range(len(other.rows)))}
+            yield Finding("readings.repeated_file", "fail", facts, other.label)
     for names, members in groups.items():
         by_label = {table.label: table for table in members}
         readings = [
@@ -294,8 +292,14 @@ def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding
             yield Finding("readings.repeated", "fail", facts, block.label)
 
 
-def lint_rows(table: Table[Any], rig: Rig, fewest: int) -> Iterable[Finding]:
-    """Warn where a table has fewer than ``fewest`` rows: three for one unknown, five for two."""
+def wrong_prefix(ratio: float) -> bool:
+    """Whether a wrong prefix explains the ratio of two positive numbers."""
+    return bool(abs(abs(np.log10(ratio)) - np.log10(PREFIX)) < NEAR_PREFIX)
+
+
+def lint_rows(table: Table[Any], rig: Rig, unknowns: int) -> Iterable[Finding]:
+    """Warn where a table has few rows: fewer than three for one unknown, five for two."""
+    fewest = 1 + 2 * unknowns
     if len(table.rows) < fewest:
         yield Finding("readings.few", "warn", {"rows": len(table.rows), "wanted": fewest}, table.label)
 

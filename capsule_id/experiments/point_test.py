@@ -21,6 +21,7 @@ from scipy import stats
 from capsule_id.experiments.base import (
     LEVEL,
     About,
+    Fitted,
     Start,
     ValuesBySymbol,
     axis_label,
@@ -28,7 +29,6 @@ from capsule_id.experiments.base import (
     refit,
     scatter_prior,
 )
-from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
     FrictionModel,
@@ -275,7 +275,7 @@ def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
 
 def lint_line(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Report few rows and missing reading errors."""
-    yield from lint_rows(table, rig, 5)
+    yield from lint_rows(table, rig, 2)
     if table.settings.sd_ratio is None:
         yield from lint_reading_errors(table, rig)
 
@@ -362,9 +362,10 @@ def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
     findings = []
     for e in lines:
         column = e.table.columns[e.reading]
-        if e.scale_known or (e.n > 2 and e.step == 0.0) or (column.sd is not None and e.n < 3):
+        few = e.n <= 2
+        if e.scale_known or (column.sd is not None if few else e.step == 0.0):
             continue
-        code = "lines.two_rows" if e.n < 3 else "lines.step"
+        code = "lines.two_rows" if few else "lines.step"
         facts = {"y": e.reading, "unit": column.unit, "step": e.step * column.to_display, "name": e.slope.name}
         findings.append(Finding(code, "warn", facts, e.label, (e.slope.name,)))
     return findings

@@ -5,6 +5,7 @@ from capsule_id.experiments.friction import (
     MASSES_OF_FREE,
     MESSAGES,
     NORMAL_FORCE_COLUMN,
+    SCATTER_OF_MU,
     Pulls,
     PullSettings,
     check_load,
@@ -16,7 +17,7 @@ from capsule_id.experiments.friction import (
     masses_of_pulls,
 )
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.parameters import INSTRUMENT_ERRORS, Prior, scatter
+from capsule_id.parameters import INSTRUMENT_ERRORS, scatter
 from capsule_id.rig.schema import ColumnRule, Entry
 from capsule_id.rig.toml import POSITIVE
 
@@ -24,7 +25,7 @@ from capsule_id.rig.toml import POSITIVE
 
 
 SLIDING_SCATTER = scatter(
-    "sliding_scatter", "1", "relative scatter of mu, steady sliding", r"s_\mathrm{sl}", Prior("halfnormal", 0.0, 0.05)
+    "sliding_scatter", "1", "relative scatter of mu, steady sliding", r"s_\mathrm{sl}", SCATTER_OF_MU
 )
 
 

@@ -13,6 +13,7 @@ from capsule_id.experiments.friction import (
     CAPTIONS,
     MESSAGES,
     NORMAL_FORCE_COLUMN,
+    SCATTER_OF_MU,
     FrictionExperiment,
     Pulls,
     PullSettings,
@@ -38,8 +39,10 @@ TILT_SD = scatter(
     "tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", Prior("halfnormal", 0.0, np.deg2rad(1.0))
 )
 PULL_SCATTER = scatter(
-    "pull_scatter", "1", "relative scatter of mu, pulls until slip", r"s_\mathrm{pull}", Prior("halfnormal", 0.0, 0.05)
+    "pull_scatter", "1", "relative scatter of mu, pulls until slip", r"s_\mathrm{pull}", SCATTER_OF_MU
 )
+#: A side of the triangle below the board.
+SIDE = ColumnRule("m", POSITIVE, usual=(5e-3, 5.0))
 #: Number of trials of the twin, and their scatter, rad.
 TRIALS, TRIAL_SD = 4, np.deg2rad(0.5)
 
@@ -121,8 +124,8 @@ KIND = Kind(
     name="static_friction",
     columns={
         "angle": ColumnRule("rad", SLOPE_ANGLE),
-        "height": ColumnRule("m", POSITIVE, usual=(5e-3, 5.0)),
-        "length": ColumnRule("m", POSITIVE, usual=(5e-3, 5.0)),
+        "height": SIDE,
+        "length": SIDE,
         "force": ColumnRule("N", POSITIVE),
         "normal_force": NORMAL_FORCE_COLUMN,
     },
@@ -139,7 +142,7 @@ KIND = Kind(
     informs="mu",
     captions=CAPTIONS,
     messages=MESSAGES,
-    lint=(partial(lint_rows, fewest=3),),
+    lint=(partial(lint_rows, unknowns=1),),
     check=check_scatter,
     paper=friction_estimates,
     panels=friction_panels,

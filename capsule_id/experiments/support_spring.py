@@ -7,8 +7,7 @@ from typing import Annotated
 import numpy as np
 from scipy import stats
 
-from capsule_id.experiments.base import LEVEL, refit
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import LEVEL, Fitted, refit
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.point_test import LINE_MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
 from capsule_id.parameters import INSTRUMENT_ERRORS, Parameter, by_index, parameter

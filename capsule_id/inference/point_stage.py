@@ -11,8 +11,7 @@ from scipy.optimize import minimize
 
 from capsule_id.console import threads
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Experiment, Whiteness, correlated_records
-from capsule_id.experiments.context import Tension
+from capsule_id.experiments.base import Experiment, Tension, Whiteness, correlated_records
 from capsule_id.experiments.friction_model import FrictionModel, SurfaceExperiment, model_lines
 from capsule_id.experiments.kind import Registry, make_experiments, paper_estimates, select_tables
 from capsule_id.inference.joint_fit import joint_fit
@@ -101,7 +100,7 @@ class SampledFit:
 
     ``target`` holds the experiments as fitted, with divided records.
 
-    Checks and tables of experiments read it as ``capsule_id.experiments.context.Fitted``.
+    Checks and tables of experiments read it as ``capsule_id.experiments.base.Fitted``.
 
     Attributes
     ----------

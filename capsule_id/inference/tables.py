@@ -34,8 +34,7 @@ def precision_gained(s: SampledFit) -> ResultTable:
     target, joint = s.target, s.fit
     shared, known = shared_symbols(target), run_parameters(target)
     alone = runs_alone(target, joint)
-    sds = dict(zip(alone.names, np.sqrt(np.diag(alone.covariance)), strict=True))
-    runs = {name: float(sd * abs(joint.values[name])) if name in known else np.nan for name, sd in sds.items()}
+    runs = {name: sd * abs(joint.values[name]) if name in known else np.nan for name, (_, sd) in alone.items()}
     rows = {}
     for name in (row.name for row in target.parameters if row.symbol in shared):
         rows[name] = [_sd(s.bench, s.bench_sample, name), runs[name], _sd(joint, s.posterior, name)]

@@ -141,6 +141,8 @@ def noisy_stretch(values: np.ndarray, period: float, row: int) -> slice | None:
 FEWEST_PERIODS = 3.0
 #: Standard errors beyond which a sign counts as wrong.
 SIGN_ERRORS = 6.0
+#: Admissible ratio of a recorded derivative to that of a recorded position.
+OF_DERIVATIVE = 0.5, 2.0
 
 
 @dataclass(frozen=True)

@@ -76,6 +76,15 @@ class RecordView(MotionView):
     at_contact: Gains | None
 
 
+@dataclass(frozen=True)
+class RunRecord:
+    """A recorded run as in the figures of the paper; ``force`` (n,) is the fitted drive at its samples, N."""
+
+    name: str
+    view: RecordView
+    force: np.ndarray
+
+
 def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | None = None) -> RecordView:
     """Filter, differentiate and cut a recorded run.
 

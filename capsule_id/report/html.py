@@ -17,11 +17,11 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.experiments.context import RunRecord
 from capsule_id.experiments.kind import select_tables
 from capsule_id.inference.result import STATED, Result
 from capsule_id.parameters import QUANTILE_975, Name, is_stated, symbol_of
 from capsule_id.records.motion import UNDECIDED
+from capsule_id.records.view import RunRecord
 from capsule_id.report.columns import (
     MISSING,
     SampledParameters,

@@ -12,7 +12,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import Fitted
 from capsule_id.experiments.free_vibration import decrement
 from capsule_id.experiments.free_vibration.decrement import (
     decay_frequency,

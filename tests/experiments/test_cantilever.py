@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import Fitted
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.support_spring import SupportSpring, cantilever_exponent, check_cantilever
 from capsule_id.report.messages import finding_text, messages_of

@@ -13,8 +13,7 @@ import pandas as pd
 import pytest
 
 from capsule_id.api import read_rig
-from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import About, Experiment, Fitted, Start, ValuesBySymbol
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.kind import make_experiments

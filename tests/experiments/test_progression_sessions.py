@@ -15,7 +15,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.stats import multivariate_normal, norm
 
 from capsule_id.api import read_rig
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import Fitted
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.progression.density import (
     INNER,

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.context import RunRecord
 from capsule_id.experiments.kind import default_registry
-from capsule_id.records.view import SMALLEST_RATE_GAIN, Gains, RecordView, describe_run, view_record
+from capsule_id.records.view import SMALLEST_RATE_GAIN, Gains, RecordView, RunRecord, describe_run, view_record
 from capsule_id.report.figures.fits import channel_history, force_on_rod, overview, overview_size, phase_plane
 from capsule_id.report.figures.style import new_axes, new_figure, png
 from capsule_id.report.messages import finding_text, messages_of

@@ -10,9 +10,9 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.experiments.lint import lint_channel, lint_smooth, lint_times
+from capsule_id.experiments.lint import USUAL, lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import Prior, nuisance, scatter
-from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, drive_power, phasor
+from capsule_id.records.faults import FEWEST_PERIODS, OF_DERIVATIVE, SIGN_ERRORS, derivative_ratio, drive_power, phasor
 from capsule_id.records.tones import recorded_drive, stated_Omega
 from capsule_id.records.view import describe_run
 from capsule_id.rig.filters import median_step, sampling_step
@@ -160,9 +160,8 @@ DRIVE_RULES = (
 HARMONICS, STRONG = range(1, 6), 0.15
 #: Fewest samples in a period of the drive, or of one of its harmonics.
 FEWEST_SAMPLES = 4.0
-#: Admissible ratio of the recorded acceleration to that of the recorded position X1 = x_rel + x_capsule; without
-#: x_capsule its motion is unknown, so the limits are wide.
-RATIO_OF_X1, RATIO_OF_X_REL = (0.5, 2.0), (0.1, 10.0)
+#: Admissible ratio of the recorded acceleration to that of x_rel alone: the motion of the capsule is unknown.
+RATIO_OF_X_REL = (0.1, 10.0)
 
 
 def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
@@ -204,7 +203,7 @@ def _columns(table: Table[Any]) -> Iterable[Finding]:
     if abs(first.value) < SIGN_ERRORS * first.sd:
         return
     if "acceleration_rod" in whole:
-        low, high = RATIO_OF_X1 if "x_capsule" in whole else RATIO_OF_X_REL
+        low, high = OF_DERIVATIVE if "x_capsule" in whole else RATIO_OF_X_REL
         for harmonic in HARMONICS if "x_capsule" in whole else HARMONICS[:1]:
             frequency = harmonic * Omega
             moves, accelerates = phasor(time, position, frequency), phasor(time, whole["acceleration_rod"], frequency)
@@ -502,7 +501,7 @@ KIND = Kind(
         "time": ColumnRule("s", increasing=True),
         "x_rel": ColumnRule("m", varies=True),
         # A capsule that never moves is a valid result, so its displacement has no smallest size.
-        "x_capsule": ColumnRule("m", usual=(0.0, 0.9)),
+        "x_capsule": ColumnRule("m", usual=(0.0, USUAL["m"][1])),
         "acceleration_rod": ColumnRule("m/s^2", varies=True),
         "current": ColumnRule("A", varies=True),
         "x_base": ColumnRule("m", varies=True),

@@ -14,16 +14,18 @@ from scipy.integrate import solve_ivp
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import (
     LEVEL,
+    Fitted,
     Start,
     ValuesBySymbol,
     autocorrelation,
     axis_label,
     band,
     further_columns,
+    judged,
+    stacked,
     stretch,
 )
 from capsule_id.experiments.capsule_experiment import lag_of
-from capsule_id.experiments.context import Fitted, RunRecord
 from capsule_id.experiments.forced_run.declaration import FEWEST_SAMPLES, SETTLING_PERIODS
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
@@ -42,7 +44,7 @@ from capsule_id.physics.model import (
 )
 from capsule_id.records.motion import fit_mean_velocity, measured_motion
 from capsule_id.records.tones import relative_position, stated_gap, stated_Omega, tone_at
-from capsule_id.records.view import FILTER_ORDER, view_record
+from capsule_id.records.view import FILTER_ORDER, RunRecord, view_record
 from capsule_id.rig.filters import choose_window, median_step, sampling_step, savitzky_golay, window_samples
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTable
@@ -203,20 +205,13 @@ FEWEST_PERIODS = 4
 
 def check_repeated(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
     """Check that the residuals of no record repeat with the excitation."""
-    tests = [
-        (run, label, *found)
+    cases = [
+        (run.label, found[1], {"record": label, "F": found[0], "p": found[1], **run.noise_facts()})
         for run in runs
         for label, residuals in run.records(run.local(fit.values))
         if (found := repetition(run, residuals)) is not None
     ]
-    findings = [
-        Finding("runs.repeated", "fail", {"record": label, "F": F, "p": p, **run.noise_facts()}, run.label)
-        for run, label, F, p in tests
-        if p * len(tests) < LEVEL
-    ]
-    if findings or not tests:
-        return findings
-    return [Finding("runs.repeated", "ok", {"p": min(p for *_, p in tests)})]
+    return judged("runs.repeated", cases, LEVEL, {"p": min((p for _, p, _ in cases), default=1.0)})
 
 
 def repetition(run: CapsuleRun, residuals: Float[np.ndarray, " n"]) -> tuple[float, float] | None:
@@ -282,7 +277,7 @@ def _motion_row(run: CapsuleRun, fit: Fitted) -> dict[str, object]:
     """Motion of one record: its label, contacts, and mean velocities with the band of a new record."""
     best, seen = run.motion(run.local(fit.values), np), measured_motion(run.table)
     local = [run.local(draw) for draw in fit.draws[:BAND_DRAWS]]
-    sample = run.motion(_stacked(local), np) if local else None
+    sample = run.motion(stacked(local), np) if local else None
     evidence, found = seen.evidence, seen.evidence.mean_velocity
     period = evidence.repeat.period if evidence.repeat else None
 
@@ -303,11 +298,6 @@ def _motion_row(run: CapsuleRun, fit: Fitted) -> dict[str, object]:
     if found is not None:
         row["mean velocity, record, mm/s"] = f"{1e3 * found.velocity:.4g} ± {sd:.2g}"
     return row
-
-
-def _stacked(draws: Sequence[ValuesBySymbol]) -> dict[str, np.ndarray]:
-    """(draws,) values by symbol."""
-    return {name: np.array([draw[name] for draw in draws]) for name in draws[0]}
 
 
 # panels: Plot data of a forced run: every channel with its residuals, and the phase portrait.
@@ -364,7 +354,7 @@ class OtherRun(CapsuleRun):
 
         ``theta`` is the point fit. Bands use at most ``BAND_DRAWS`` of ``draws`` and exclude the noise.
         """
-        bands = self.predict(_stacked(draws[:BAND_DRAWS]), np) if draws else [None] * len(self.channels)
+        bands = self.predict(stacked(draws[:BAND_DRAWS]), np) if draws else [None] * len(self.channels)
         panels = []
         for channel, part, seen, drawn in zip(
             self.channels, self.scaled(theta, np), self.predict(theta, np), bands, strict=False

@@ -19,6 +19,7 @@ from capsule_id.experiments.free_vibration.decrement import (
 from capsule_id.experiments.free_vibration.lint import MESSAGES, lint_decay
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
+    WIDE,
     DecayModel,
     DecaySettings,
     block_size,
@@ -70,10 +71,10 @@ TIME_SD = scatter("time_sd", "s", "noise of the times of turning points", r"\sig
 AMPLITUDE = nuisance("amplitude", "m", "first turning point of a decay", "a_0")
 NOISE_TIME = Parameter("noise_time", "s", "correlation time of a record's noise", r"\tau", physical=False)
 WHITE_RATIO = Parameter(
-    "white_ratio", "1", "white noise over correlated noise", "w", Prior("lognormal", 1.0, 100.0), physical=False
+    "white_ratio", "1", "white noise over correlated noise", "w", Prior("lognormal", 1.0, WIDE), physical=False
 )
 DRIFT_RATIO = Parameter(
-    "drift_ratio", "1", "drift over noise of a record", "d", Prior("lognormal", 3.0, 100.0), physical=False
+    "drift_ratio", "1", "drift over noise of a record", "d", Prior("lognormal", 3.0, WIDE), physical=False
 )
 DRIFT_TIME = Parameter("drift_time", "s", "correlation time of a record's drift", r"\tau_d", physical=False)
 TURNING_TIME = nuisance("turning_time", "s", "time of the first turning point of a decay", "t_0")

@@ -9,8 +9,16 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import LEVEL, Start, ValuesBySymbol, further_columns, refit
-from capsule_id.experiments.context import Check, Fitted
+from capsule_id.experiments.base import (
+    LEVEL,
+    Check,
+    Fitted,
+    Start,
+    ValuesBySymbol,
+    further_columns,
+    refit,
+    weighted_mean,
+)
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
@@ -79,13 +87,10 @@ def check_stiffness(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding
     """Check that k1 of single records does not depend on amplitude (the paper's "linear near the working point")."""
     if len(records) < 2:
         return []
-    estimates = [refit(e, e.local(fit.values), [])["k1"] for e in records]
-    k1, sd = (np.array(column) for column in zip(*estimates, strict=True))
-    weight = sd**-2.0
-    mean = np.average(k1, weights=weight)
-    q = float(np.sum(weight * (k1 - mean) ** 2))
+    k1, sd = zip(*(refit(e, e.local(fit.values), [])["k1"] for e in records), strict=True)
+    q = weighted_mean(k1, sd)[2]
     p = float(stats.chi2.sf(q, len(records) - 1))
-    facts = {"records": len(records), "low": k1.min(), "high": k1.max(), "chi_square": q, "p": p}
+    facts = {"records": len(records), "low": min(k1), "high": max(k1), "chi_square": q, "p": p}
     return [Finding("decays.stiffness", "fail" if p < LEVEL else "ok", facts)]
 
 
@@ -134,9 +139,8 @@ def changes_of_second_half(e: DecayRecord, theta: ValuesBySymbol) -> dict[str, t
     found = [_estimates(half, theta) for half in _halves(e)]
     if not found:
         return {}
-    (first, first_sd), (second, second_sd) = found
-    sd = {name: np.hypot(first_sd[name], second_sd[name]) for name in first}
-    return {name: (first[name], second[name], float((second[name] - first[name]) / sd[name]), True) for name in first}
+    pairs = {name: (*found[0][name], *found[1][name]) for name in found[0]}
+    return {name: (a, b, float((b - a) / np.hypot(sd_a, sd_b)), True) for name, (a, sd_a, b, sd_b) in pairs.items()}
 
 
 def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
@@ -285,15 +289,13 @@ def _halves(e: DecayRecord) -> list[DecayRecord]:
     return [e.with_model(e.model, table=table) for table in tables]
 
 
-def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
-    """Estimates and standard errors of the physical parameters from one half, from the values ``theta`` of the whole."""
+def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Estimate and standard error of each physical parameter from one half, from the values ``theta`` of the whole."""
     if half.closed and not half.model.whitened:
-        pairs = refit(half, theta, [])
-        return {name: v for name, (v, _) in pairs.items()}, {name: sd for name, (_, sd) in pairs.items()}
+        return refit(half, theta, [])
     screening = Screening(half, k1=theta["k1"])
     found, _ = screening.fit(half.model, screening.scaled(theta))
-    names = ("k1", "c", *half.model.symbols)
-    return {name: found.values[name] for name in names}, {name: found.errors[name] for name in names}
+    return {name: (found.values[name], found.errors[name]) for name in ("k1", "c", *half.model.symbols)}
 
 
 check_halves = halves(changes_of_second_half)

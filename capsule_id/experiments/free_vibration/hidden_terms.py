@@ -8,8 +8,7 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lsim
 
-from capsule_id.experiments.base import ValuesBySymbol, stretch, without
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import Fitted, ValuesBySymbol, stretch, without
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
@@ -27,6 +26,8 @@ from capsule_id.views import Facts, Finding, Level
 
 #: Step of difference quotients, in natural units of each parameter; smallest unit of c, relative to sqrt(k1 m1).
 SENSITIVITY_STEP, SMALLEST_C = 1e-5, 0.01
+#: Responses and speeds that are smaller than this, relative to the largest ones, are rounding.
+ROUNDING = 1e-6
 #: Points per period, and fewest points, of the responses to further forces.
 RESPONSE_POINTS, FEWEST_POINTS = 60, 200
 
@@ -95,8 +96,6 @@ MOST_HALF_SWINGS, FEWEST_HALF_SWINGS = 60, 8
 MOST_READINGS, FEWEST_READINGS, FEWEST_OF_ALL = 64, 6, 200
 #: Readings nearer to a turning point than this part of a half swing are left out: a zero may jump a little later.
 NEAR = 0.1
-#: A rod moves where it is faster than this part of its largest speed.
-MOVING = 1e-6
 #: Largest sum of squares of zeros that jump where the rod turns, relative to that of zeros that move slowly.
 #: White and correlated noise, walks and steps of the readings leave 0.83 or more, hysteresis of 5 % 0.77 or more.
 JUMPING = 0.75
@@ -126,7 +125,7 @@ def zero_jumps(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | N
     curve = part.values - left
     rate = np.gradient(curve, part.time)
     # A rod that has stopped turns no more; the sign of its rate is that of rounding errors.
-    moving = np.arange(len(rate)) <= np.flatnonzero(np.abs(rate) >= MOVING * np.max(np.abs(rate)))[-1]
+    moving = np.arange(len(rate)) <= np.flatnonzero(np.abs(rate) >= ROUNDING * np.max(np.abs(rate)))[-1]
     turns = np.flatnonzero(np.diff(rate[moving] > 0.0))
     turned = 0.5 * (part.time[turns] + part.time[turns + 1])
     if len(turns) < FEWEST_HALF_SWINGS - 1:
@@ -172,8 +171,6 @@ def _least_squares(known: np.ndarray, columns: np.ndarray, values: np.ndarray) -
 #: Changes of c and of k1 by a force at its limit that matter: relative to the value, and in standard errors.
 CHANGES: Mapping[str, float] = {"c": 0.2, "k1": 0.05}
 CHANGE_IN_ERRORS = 3.0
-#: Responses to a force that are shorter than this beside the nuisances, relative to their length, are rounding.
-UNSEEN = 1e-6
 #: Estimates further below zero, in standard errors, count as this one.
 LOWEST = -30.0
 
@@ -290,7 +287,7 @@ def reduced(e: Decay, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarra
     parts = [e.whitened(theta, part) for part in (shared, absent, left[:, None])]
     known, others, residuals = without(own, *parts)
     # The offset takes up dry friction in a decay that does not swing: only rounding is left of it.
-    others[:, np.linalg.norm(others, axis=0) <= UNSEEN * np.linalg.norm(parts[1], axis=0)] = 0.0
+    others[:, np.linalg.norm(others, axis=0) <= ROUNDING * np.linalg.norm(parts[1], axis=0)] = 0.0
     misfit = residuals - known @ np.linalg.lstsq(known, residuals, rcond=None)[0]
     noise = np.sqrt(np.sum(misfit**2) / max(e.n - own.shape[1] - known.shape[1], 1))
     return known / noise, others / noise, residuals[:, 0] / noise

@@ -24,13 +24,14 @@ from capsule_id.experiments.free_vibration.readings import (
 )
 from capsule_id.experiments.lint import (
     ACCELERATIONS,
-    PERIODS,
-    WRONG_PREFIX,
+    PREFIX,
+    USUAL_PERIODS,
     Number,
     lint_channel,
     lint_rig_quantities,
     lint_smooth,
     lint_times,
+    wrong_prefix,
 )
 from capsule_id.parameters import parameter
 from capsule_id.records.faults import aliases, sampling
@@ -60,7 +61,7 @@ FEWEST_PERIODS = 2
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
-RATIOS = (("1000 (s and ms)", 1000.0), ("60 (min and s)", 60.0), ("2 pi (rad and cycles)", 2.0 * np.pi))
+RATIOS = (("1000 (s and ms)", PREFIX), ("60 (min and s)", 60.0), ("2 pi (rad and cycles)", 2.0 * np.pi))
 
 
 def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
@@ -133,7 +134,7 @@ def _scales(table: Table[Any], rig: Rig, frequency: float, values: np.ndarray) -
         (f"{label}.time", f"{label}.{channel}"),
         (label, column.unit, column.to_display, "decays.magnitude"),
     )
-    yield from Number(period, 1.0 / frequency, "s", PERIODS, scales[:1], *written).unusual(rig)
+    yield from Number(period, 1.0 / frequency, "s", USUAL_PERIODS, scales[:1], *written).unusual(rig)
     size = 0.5 * float(np.ptp(values)) * (2.0 * np.pi * frequency) ** (2 - CHANNELS[channel].order)
     yield from Number(f"the acceleration in {table.file}", size, "m/s^2", ACCELERATIONS, scales, label).unusual(rig)
 
@@ -179,7 +180,7 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
             # A prior would hide a wrong unit.
             "unit": bool(unusual)
             or any(f.facts["scales"] == ("m1",) for f in lint_rig_quantities(rig))
-            or (stated is not None and abs(abs(np.log10(k1 / middle)) - 3.0) < WRONG_PREFIX),
+            or (stated is not None and wrong_prefix(k1 / middle)),
         }
         # What is usual is no measurement: small rigs and pendulums have another k1.
         certain = coarse or refuted or stated is not None

@@ -9,7 +9,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
-from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, phasor
+from capsule_id.records.faults import FEWEST_PERIODS, OF_DERIVATIVE, SIGN_ERRORS, derivative_ratio, phasor
 from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
@@ -52,8 +52,6 @@ def channel_of(table: Table) -> str:
 # kinematics: Finding on the columns of a free decay: each further channel must be a derivative of the first one.
 
 
-#: Admissible ratio of a channel to the derivative of the first one, at the frequency of the decay.
-LOWEST, HIGHEST = 0.5, 2.0
 #: Name of a derivative by its order.
 DERIVATIVES = {1: "derivative", 2: "second derivative"}
 
@@ -70,7 +68,7 @@ def lint_kinematics(table: Table[Any], used: slice, period: float) -> Iterable[F
         order = CHANNELS[name].order - CHANNELS[first].order
         ratio = derivative_ratio(lower, higher, Omega, order).real
         seen = all(abs(one.value) > SIGN_ERRORS * one.sd for one in (lower, higher))
-        if seen and not LOWEST <= ratio <= HIGHEST:
+        if seen and not OF_DERIVATIVE[0] <= ratio <= OF_DERIVATIVE[1]:
             facts = {"file": table.file, "name": name, "first": first, "order": order, "ratio": ratio}
             yield Finding("decays.kinematics", "fail", facts, table.label)
 
@@ -78,11 +76,12 @@ def lint_kinematics(table: Table[Any], used: slice, period: float) -> Iterable[F
 def _contradiction(facts: Facts) -> str:
     """The ratio of the two columns, and what to check."""
     check = "Check the units of both columns."
-    if -HIGHEST <= facts["ratio"] <= -LOWEST:
+    low, high = OF_DERIVATIVE
+    if -high <= facts["ratio"] <= -low:
         check = "One of them has the wrong sign: map it with scale = -1."
     return (
         f"{facts['file']}: {facts['name']} must be the {DERIVATIVES[facts['order']]} of {facts['first']}; at the frequency "
-        f"of the decay it is {facts['ratio']:.3g} times that ({LOWEST:g} to {HIGHEST:g} allowed). {check} Or leave one of "
+        f"of the decay it is {facts['ratio']:.3g} times that ({low:g} to {high:g} allowed). {check} Or leave one of "
         f"them out."
     )
 
@@ -227,10 +226,12 @@ DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
 FURTHER = (*DAMPING.values(), "k_cubic")
 #: What every parameter of a further force stands for, in words.
 EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
-#: Keys of rig.toml that state a model, and log-normal priors of dry friction and quadratic damping: median relative to
-#: their natural units, and factor.
+#: Keys of rig.toml that state a model, and median of the log-normal priors of dry friction and quadratic damping, relative
+#: to their natural units.
 CHOICES = ("damping", "stiffness", "drift", "noise")
-FURTHER_MEDIAN, FURTHER_FACTOR = 0.05, 100.0
+FURTHER_MEDIAN = 0.05
+#: Factor of a log-normal prior of a quantity of which little is known.
+WIDE = 100.0
 #: Periods of a record that a model with further forces, correlated noise or a Gaussian-process drift is fitted to, at most:
 #: its evaluations take milliseconds then.
 MOST_PERIODS = 250
@@ -249,7 +250,7 @@ def further_parameters(symbols: Sequence[str], k1: float, m1: float, size: float
     A prior far below that would prefer the absence of a force that the record does not exclude, and the c beside it.
     """
     priors = {
-        symbol: Prior("lognormal", FURTHER_MEDIAN * unit, FURTHER_FACTOR)
+        symbol: Prior("lognormal", FURTHER_MEDIAN * unit, WIDE)
         if symbol in DAMPING.values()
         else Prior("normal", 0.0, unit)
         for symbol, unit in natural_units(k1, m1, size).items()

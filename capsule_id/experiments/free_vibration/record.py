@@ -72,7 +72,7 @@ from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.release import shortened
 from capsule_id.records.tones import noise_level
 from capsule_id.records.view import FILTER_ORDER
-from capsule_id.rig.filters import choose_window, savitzky_golay
+from capsule_id.rig.filters import TIMING_TOLERANCE, choose_window, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Points
 
@@ -109,7 +109,7 @@ class ReadingTimes(eqx.Module):
     def of(cls, blocks: Blocks) -> "ReadingTimes":
         """Times of the readings of ``blocks``; equal blocks share count and step."""
         count, step = blocks.count, (blocks.last - blocks.first) / np.maximum(blocks.count - 1.0, 1.0)
-        if np.ptp(count) == 0.0 and np.ptp(step) <= 0.01 * np.max(step):
+        if np.ptp(count) == 0.0 and np.ptp(step) <= TIMING_TOLERANCE * np.max(step):
             count, step = count[:1], np.mean(step, keepdims=True)
         return cls(blocks.time, blocks.first, blocks.last, count, step, int(np.max(count)))
 

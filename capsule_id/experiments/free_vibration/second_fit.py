@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.experiments.base import LEVEL, Start, further_columns, ljung_box, refit
-from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, Decrement, viscous_fit
+from capsule_id.experiments.base import LEVEL, Start, further_columns, ljung_box, refit, weighted_mean
+from capsule_id.experiments.free_vibration.decrement import REFINED, STRONGEST, UNKNOWNS, Decrement, viscous_fit
 from capsule_id.experiments.free_vibration.hidden_terms import SENSITIVITY_STEP, force_responses, sensitivities
 from capsule_id.experiments.free_vibration.models import (
     STEPS,
@@ -128,9 +128,9 @@ INSIDE, ABSENT_TERM = 1e-3, 1e-9
 UNKNOWN = 1e-12
 #: Replaces residuals, relative to the scatter of the readings, where the model has no motion.
 UNFIT = 1e3
-#: Starts of a fit with dry friction: rounds of one batch each, standard deviations of their scaled unknowns (F_dry:
-#: logarithm) after the first round, and number of starts that are fitted.
-DRY_ROUNDS, DRY_FITS = 8, 3
+#: Starts of a fit with dry friction: rounds of one batch each, and standard deviations of their scaled unknowns (F_dry:
+#: logarithm) after the first round.
+DRY_ROUNDS = 8
 DRY_SPREADS: Mapping[str, float] = {"F_dry": 0.15, "c": 0.3, "k1": 0.01, "amplitude": 0.04}
 #: White over correlated noise that stands for white noise.
 WHITE = 1e3
@@ -320,7 +320,7 @@ class Screening:
             starts = self.dry_starts(start)
             parts = starts.reshape(-1, len(NAMES) + 1, len(NAMES))
             costs = np.concatenate([np.sum(whitened(part) ** 2, axis=1) for part in parts])
-            starts = starts[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:DRY_FITS]]
+            starts = starts[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:REFINED]]
         first = list(np.clip(starts[:, free], *inside))
         if nested:
             best = min(nested, key=lambda one: one[0].noise)[1]
@@ -593,11 +593,14 @@ def _both_fits(decays: Sequence[Any], screened: Callable[[Any, DecayModel], Scre
     pairs = ((stated, [screened(e, stated) for e in decays]), (quoted, [e.about.screened for e in decays]))
     rows = []
     for role, (model, fits) in zip(("stated", "quoted"), pairs, strict=True):
-        means = {symbol: _weighted_mean(fits, symbol) for symbol in ("k1", "c", *model.symbols)}
+        means = {
+            symbol: weighted_mean([one.values[symbol] for one in fits], [one.errors[symbol] for one in fits])
+            for symbol in ("k1", "c", *model.symbols)
+        }
         row = {
             "fit": role,
             "model": model.name,
-            "parameters": ", ".join(f"{name} = {mean:.5g} ± {sd:.2g}" for name, (mean, sd) in means.items()),
+            "parameters": ", ".join(f"{name} = {mean:.5g} ± {sd:.2g}" for name, (mean, sd, _) in means.items()),
             "noise, SI": float(np.mean([one.noise for one in fits])),
             "BIC": sum(one.bic for one in fits) - min(sum(one.bic for one in each) for _, each in pairs),
         }
@@ -606,12 +609,6 @@ def _both_fits(decays: Sequence[Any], screened: Callable[[Any, DecayModel], Scre
             row["residuals white"] = "yes" if white else "no"
         rows.append(row)
     return rows
-
-
-def _weighted_mean(fits: Sequence[Screened], symbol: str) -> tuple[float, float]:
-    """Mean of the estimates of every record, weighted by their standard errors, and its standard error."""
-    weight = np.array([one.errors[symbol] for one in fits]) ** -2.0
-    return float(np.average([one.values[symbol] for one in fits], weights=weight)), float(np.sum(weight) ** -0.5)
 
 
 def second_models(

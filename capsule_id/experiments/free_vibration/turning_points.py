@@ -10,8 +10,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, scatter_prior, stated_rate, stretch
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import (
+    Fitted,
+    Start,
+    ValuesBySymbol,
+    clock_parameters,
+    scatter_prior,
+    stated_rate,
+    stretch,
+)
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.experiment import DISAGREE, FAIL, each, halves

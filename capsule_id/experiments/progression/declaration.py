@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from capsule_id.experiments.forced_run.declaration import DriveRule, check_drive, lacks, present, stated
 from capsule_id.experiments.kind import Kind, made_by
+from capsule_id.experiments.lint import USUAL_PERIODS
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings, QuantityRule
@@ -213,7 +214,7 @@ MESSAGES = {
 KIND = Kind(
     name="progression",
     columns={
-        "period": ColumnRule("s", POSITIVE, usual=(2e-3, 20.0)),
+        "period": ColumnRule("s", POSITIVE, usual=USUAL_PERIODS),
         "f": ColumnRule("Hz", POSITIVE),
         "duty": ColumnRule("1", SHARE),
         "P_on": ColumnRule("N"),

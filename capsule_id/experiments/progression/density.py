@@ -32,7 +32,7 @@ FAR = 1e3
 #: z of the runs of a session that is integrated out. One that has its setting for itself has the inner ones only. The
 #: outer lines go on beyond their runs.
 NODES = 1.25 * np.arange(-2.0, 3.0)
-INNER, MIDDLE = slice(1, 4), 2
+INNER, MIDDLE = slice(1, -1), 2
 
 
 class Sessions(eqx.Module):

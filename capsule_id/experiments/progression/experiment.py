@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments.base import About, Start, ValuesBySymbol, band
+from capsule_id.experiments.base import About, Fitted, Start, ValuesBySymbol, band, stacked
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters
-from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, ground_parameters
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.progression.declaration import (
@@ -123,13 +122,6 @@ SESSION_STEP = 0.1
 BAND_DRAWS = 200
 #: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
 DAMPING_RATIO, FRICTION = 0.1, 0.3
-
-
-def columns_of(draws: Sequence[ValuesBySymbol]) -> dict[str, np.ndarray]:
-    """Draws of the parameters as one value each, (draws, 1)."""
-    return {
-        name: np.array([draw[name] for draw in draws])[:, None] for name in draws[0] if np.ndim(draws[0][name]) == 0
-    }
 
 
 class Progression(CapsuleForward):
@@ -292,7 +284,7 @@ class Progression(CapsuleForward):
 
     def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
         """(draws, runs) X2 for which the likelihood runs the capsule; not finite where a run fails."""
-        return np.asarray(self.runs(columns_of(draws)))
+        return np.asarray(self.runs(stacked(draws, 1)))
 
     def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: np.ndarray) -> "Progression":
         """Return the same trials with an emulator of the motions, fitted to ``motions_of_draws`` of ``draws``."""
@@ -387,7 +379,7 @@ class Progression(CapsuleForward):
         """
         time = settings[:, 0] * settings[:, 1]
         z = rng.standard_normal((3, len(draws), len(settings)))
-        own = columns_of(draws)
+        own = stacked(draws, 1)
         X2 = np.asarray(self.displacements(own, own["session_sd"] * z[0], settings))
         variance = self.reading_variance + own["trial_sd"] ** 2 + (own["trial_scatter"] * X2) ** 2
         if self.heavy:

@@ -1,6 +1,5 @@
 """Checks of the sampled posterior: agreement of experiments, modes, priors, predictions."""
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,9 +10,9 @@ from scipy import stats
 from scipy.fft import dct
 from scipy.ndimage import gaussian_filter1d
 
-from capsule_id.experiments.base import LEVEL, Experiment
-from capsule_id.experiments.lint import WRONG_PREFIX
-from capsule_id.inference.checks.settings import SMALLEST_SCATTER, basis_of, design
+from capsule_id.experiments.base import LEVEL, TIE, Experiment, basis_of
+from capsule_id.experiments.lint import wrong_prefix
+from capsule_id.inference.checks.settings import SMALLEST_SCATTER, design
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.moves import geyer_size
 from capsule_id.inference.point_stage import SampledFit
@@ -28,28 +27,25 @@ from capsule_id.views import Finding
 
 #: Family-wise false-alarm rate of the comparison between bench tests and runs, dimensionless.
 AGREEMENT_LEVEL = 0.02
+#: Part of a sample in each of the tails, where Student's t continues it.
+TAIL = 0.005
 #: Degrees of freedom of the tails without a sample: those of three trials, the fewest that show their own scatter.
 FREEDOM_WITHOUT_SAMPLE = 2
 
 
-@dataclass(frozen=True)
-class RunsAlone:
-    """Estimate from runs and priors only: ``names`` of the located parameters, u (p,), covariance (p, p)."""
+def runs_alone(target: LogPosterior, fit: PointFit) -> dict[str, tuple[float, float]]:
+    """Estimate from runs and priors: one Gauss–Newton step from the joint ``fit`` without bench residuals.
 
-    names: tuple[str, ...]
-    u: np.ndarray
-    covariance: np.ndarray
-
-
-def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
-    """Estimate from runs and priors: one Gauss–Newton step from the joint ``fit`` without bench residuals."""
+    Return u and its sd of every located parameter, by name.
+    """
     located = target.located
     misses, jacobian = linearised(target, fit.u)
     rows = np.array([owner is None or not owner.bench for owner in target.residual_owners(fit.u)])
     kept = jacobian[rows]
     covariance = np.linalg.inv(kept.T @ kept)
     u = fit.u[located] - covariance @ (kept.T @ misses[rows])
-    return RunsAlone(tuple(target.names[i] for i in located), u, covariance)
+    pairs = zip(u.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)
+    return dict(zip((target.names[i] for i in located), pairs, strict=True))
 
 
 @dataclass(frozen=True)
@@ -68,19 +64,18 @@ class Distance:
 
 
 def disagreement(
-    shared: Sequence[str], runs: RunsAlone, bench: PointFit, sample: Posterior | None
+    shared: Sequence[str], runs: Mapping[str, tuple[float, float]], bench: PointFit, sample: Posterior | None
 ) -> dict[str, Distance]:
-    """Return the distance of every ``shared`` parameter, by name; bench and runs are independent."""
+    """Return the distance of every ``shared`` parameter, by name; bench and ``runs``, u and its sd, are independent."""
     found = {}
     for name in shared:
-        i, j = runs.names.index(name), bench.names.index(name)
-        own = runs.covariance[i, i]
-        z = sd = float((bench.u[j] - runs.u[i]) / np.sqrt(bench.covariance[j, j] + own))
+        (u, own), j = runs[name], bench.names.index(name)
+        z = sd = float((bench.u[j] - u) / np.sqrt(bench.covariance[j, j] + own**2))
         if sample is not None:
             # Every shared parameter is positive: u is its logarithm.
             draws = np.log(sample.draws[..., j].ravel())
-            blurred = draws + np.sqrt(own) * np.random.default_rng(j).standard_normal(draws.size)
-            z = _by_sample(blurred, float(runs.u[i]), sd)
+            blurred = draws + own * np.random.default_rng(j).standard_normal(draws.size)
+            z = _by_sample(blurred, u, sd)
         found[name] = Distance(sd, z)
     return found
 
@@ -90,16 +85,16 @@ def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
 
     Beyond the outermost 1 % a Student t tail, fitted to the outer quantiles, extrapolates the sample.
     """
-    below = np.mean(draws < value)
-    if 0.005 < below < 0.995:
+    below, centre = np.mean(draws < value), float(np.median(draws))
+    if TAIL < below < 1.0 - TAIL:
         return float(-stats.norm.ppf(below))
     # The outer quantiles at two levels give the number of degrees of freedom of the tail.
-    levels = np.array([0.005, 0.05]) if below < 0.5 else np.array([0.995, 0.95])
-    centre = float(np.median(draws))
-    outer, inner = np.abs(np.quantile(draws, levels) - centre)
+    levels = np.array([TAIL, 10.0 * TAIL])
+    outer, inner = np.abs(np.quantile(draws, levels if value < centre else 1.0 - levels) - centre)
     grid = np.geomspace(1.0, 1e3, 200)
-    freedom = float(grid[np.argmin(np.abs(stats.t.isf(0.005, grid) / stats.t.isf(0.05, grid) - outer / inner))])
-    scale = outer / stats.t.isf(0.005, freedom)
+    ratio = np.divide(*stats.t.isf(levels[:, None], grid))
+    freedom = float(grid[np.argmin(np.abs(ratio - outer / inner))])
+    scale = outer / stats.t.isf(TAIL, freedom)
     tail = stats.t.logsf(abs(value - centre) / scale, freedom)
     # z with the same log(1 - Phi(z)), also where the tail itself underflows.
     z = np.linspace(0.0, 40.0, 8001)
@@ -355,11 +350,7 @@ def _finding(s: SampledFit, row: Parameter, conflict: Mapping[str, float], p: fl
     name = row.name
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
     prior = prior_of(row)
-    unit = (
-        name in s.rig.priors
-        and prior.kind == "lognormal"
-        and abs(abs(math.log10(conflict["value"] / prior.median)) - 3.0) < WRONG_PREFIX
-    )
+    unit = name in s.rig.priors and prior.kind == "lognormal" and wrong_prefix(conflict["value"] / prior.median)
     facts = {
         "name": name,
         "key": "" if is_stated(name) or unit or name in in_doubt(s) else row.prior_key,
@@ -389,8 +380,6 @@ MOST_REPLICATES, FEWEST_REPLICATES, REPLICATED_READINGS = 4000, 1000, 4_000_000
 MOST_READINGS = 5000
 #: Fewest residual degrees of freedom that can be judged.
 FEWEST_FREE = 6
-#: Probability that clean data give a finding of an experiment. The smallest p-value is half of one replicate.
-PREDICTIVE_LEVEL = 0.002
 #: Number of the slowest cosines that the trend counts.
 SLOWEST = 3
 
@@ -426,10 +415,9 @@ def p_values(residuals: np.ndarray, columns: np.ndarray) -> dict[str, float]:
     for name, statistic in STATISTICS.items():
         scale = spread if name == "largest" else 1.0
         here, there = statistic(seen / scale)[0], statistic(drawn / scale)
-        equal = np.abs(there - here) <= 1e-9 * max(1.0, abs(here))
-        found[name] = float(
-            (0.5 + np.sum(there > here + 1e-9) + 0.5 * np.sum(equal & (there <= here + 1e-9))) / (1 + number)
-        )
+        tie = TIE * max(1.0, abs(here))
+        larger, equal = np.sum(there > here + tie), np.sum(np.abs(there - here) <= tie)
+        found[name] = float((0.5 + larger + 0.5 * equal) / (1 + number))
     return found
 
 
@@ -454,6 +442,7 @@ def experiment_p_values(e: Experiment, theta: Mapping[str, float]) -> dict[str, 
 def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding]:
     """Compare runs of signs, largest residual and trend of every bench test with replicates.
 
+    ``LEVEL`` is the probability that clean data give a finding of one test; the smallest p-value is half of one replicate.
     Tests with outliers, and the ``known`` ones, whose trials are known not to be alike, are left out: their residuals
     have a named cause.
     """
@@ -463,7 +452,7 @@ def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding
             continue
         found = experiment_p_values(e, e.local(s.values))
         judged += bool(found)
-        small = {name: p for name, p in found.items() if p * len(found) < PREDICTIVE_LEVEL}
+        small = {name: p for name, p in found.items() if p * len(found) < LEVEL}
         # One large residual hardly moves a record's fit, and tables have their own check of outliers.
         worst = min(small, key=lambda name: (name == "largest", small[name]), default=None)
         if worst is not None:

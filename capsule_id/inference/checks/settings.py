@@ -6,7 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from capsule_id.experiments.base import Experiment, ValuesBySymbol, autocorrelation, estimate, refit
+from capsule_id.experiments.base import (
+    Experiment,
+    ValuesBySymbol,
+    autocorrelation,
+    basis_of,
+    estimate,
+    judged,
+    of_neighbours,
+    permutation_p,
+    refit,
+)
 from capsule_id.experiments.friction import varies
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.least_squares import linearised
@@ -23,8 +33,6 @@ from capsule_id.views import Facts, Finding
 
 #: Relative step of difference quotients, dimensionless.
 DIFFERENCE = 1e-5
-#: Singular values below this part of the largest one are those of columns that depend on each other.
-DEPENDENT = 1e-8
 #: Largest number of flagged rows per experiment. More outliers indicate a wrong model, not wrong rows.
 MOST_FLAGGED = 3
 
@@ -78,15 +86,6 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
         found.append(Outlier(int(keep[worst]), float(score[worst]), p))
         keep = np.delete(keep, worst)
     return found
-
-
-def basis_of(columns: np.ndarray) -> np.ndarray:
-    """(n, rank) orthonormal columns with the span of ``columns`` (n, p).
-
-    Columns of nuisances may span those of parameters, as discrepancies do that all trials of a setting share.
-    """
-    u, size, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, size > DEPENDENT * np.max(size, initial=0.0)]
 
 
 def _known_share(experiment: Experiment, theta: ValuesBySymbol) -> np.ndarray:
@@ -162,34 +161,13 @@ def check_order(s: SampledFit, by_load: Collection[str] = ()) -> list[Finding]:
     return judged("trials.order", cases, ORDER_LEVEL, {"number": len(cases)})
 
 
-def judged(
-    code: str, cases: Sequence[tuple[str, float, Facts]], level: float, number: Facts | None = None
-) -> list[Finding]:
-    """Findings of one check of several experiments with this family-wise false-alarm rate (Bonferroni); [] without any.
-
-    Parameters
-    ----------
-    cases : label of the experiment, p-value and facts
-    number : facts of the finding where no case fails
-    """
-    failed = [Finding(code, "fail", facts, label) for label, p, facts in cases if p * len(cases) < level]
-    return failed or [Finding(code, "ok", number or {})] * bool(cases)
-
-
-def random_orders(values: np.ndarray) -> np.ndarray:
-    """(``PERMUTATIONS``, n) of ``values`` (n,), the same ones each time."""
-    return np.random.default_rng(0).permuted(np.tile(values, (PERMUTATIONS, 1)), axis=1)
-
-
 def lag_1(residuals: np.ndarray) -> tuple[float, float]:
     """Lag-1 correlation of residuals (n,) and the probability that a random order gives as large a one."""
     correlation = float(autocorrelation(residuals, 1)[0])
     n = len(residuals)
     if n > MANY_ROWS:
         return correlation, float(stats.norm.sf(correlation * np.sqrt(n)))
-    shuffled = random_orders(residuals - np.mean(residuals))
-    random = np.sum(shuffled[:, 1:] * shuffled[:, :-1], axis=1) / np.sum(shuffled**2, axis=1)
-    return correlation, float((1 + np.sum(random >= correlation - 1e-12)) / (1 + PERMUTATIONS))
+    return correlation, permutation_p(residuals - np.mean(residuals), of_neighbours, PERMUTATIONS)
 
 
 def check_tables(s: SampledFit) -> list[Finding]:
@@ -348,7 +326,7 @@ def _of_levels(groups: Sequence[np.ndarray]) -> float:
 def trend(residuals: np.ndarray, load: np.ndarray) -> float:
     """Probability that a random order of residuals (n,) has as large a correlation with the logarithm of ``load`` (n,)."""
     x, r = np.log(load) - np.mean(np.log(load)), residuals - np.mean(residuals)
-    return float((1 + np.sum(np.abs(random_orders(r) @ x) >= np.abs(r @ x) * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
+    return permutation_p(r, lambda orders: np.abs(orders @ x), PERMUTATIONS)
 
 
 def _within_loads(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
@@ -369,18 +347,16 @@ def _standardised(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
     return residuals / np.maximum(sd, SMALLEST_SCATTER)[groups]
 
 
-def _loads(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
+def _loads(s: SampledFit, e: Experiment) -> list[np.ndarray]:
     """Load, N, and coefficient of every row without the flagged ones."""
     assert e.loads is not None, "the table has loads"
-    load, coefficient = (np.delete(x, list(s.flagged.get(e.label, []))) for x in e.loads)
-    return load, coefficient
+    return _unflagged(s, e, e.loads)
 
 
-def _unflagged(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals in units of the noise and their Jacobian, without flagged rows."""
+def _unflagged(s: SampledFit, e: Experiment, parts: Sequence[np.ndarray] | None = None) -> list[np.ndarray]:
+    """Residuals in units of the noise and their Jacobian, or other ``parts``, without the flagged rows."""
     flagged = list(s.flagged.get(e.label, []))
-    residuals, columns = design(e, e.local(s.values))
-    return np.delete(residuals, flagged), np.delete(columns, flagged, axis=0)
+    return [np.delete(x, flagged, axis=0) for x in parts or design(e, e.local(s.values))]
 
 
 def between(residuals: Sequence[np.ndarray]) -> tuple[float, float]:
@@ -406,5 +382,4 @@ def between(residuals: Sequence[np.ndarray]) -> tuple[float, float]:
     rows = (len(values) - float(np.sum(sizes**2)) / len(values)) / (len(sizes) - 1)
     variance = max(0.0, (found / (len(sizes) - 1) - within) / rows)
     correlation = variance / (variance + within) if variance > 0.0 else 0.0
-    p = float((1 + np.sum(sum_between(random_orders(values)) >= found * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
-    return float(np.sqrt(1.0 + (rows - 1.0) * correlation)), p
+    return float(np.sqrt(1.0 + (rows - 1.0) * correlation)), permutation_p(values, sum_between, PERMUTATIONS)

@@ -10,7 +10,16 @@ from jaxtyping import Float, Int
 from scipy import stats
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import LAGS, LEVEL, Experiment, correlated_records, estimate, refit
+from capsule_id.experiments.base import (
+    LAGS,
+    LEVEL,
+    Experiment,
+    correlated_records,
+    estimate,
+    judged,
+    refit,
+    weighted_mean,
+)
 from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.inference.checks.posterior import (
     PRIOR_PULL,
@@ -21,7 +30,7 @@ from capsule_id.inference.checks.posterior import (
     default_scatter,
     in_doubt,
 )
-from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, judged, outliers
+from capsule_id.inference.checks.settings import MOST_FLAGGED, check_trials, outliers
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.point_stage import PHASES, SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
@@ -302,10 +311,7 @@ def has_own_nuisances(e: Experiment) -> bool:
 
 def widening(pairs: Sequence[tuple[float, float]]) -> Widening:
     """Factor and quantile from estimates and standard errors of parts."""
-    value, sd = np.array(pairs).T
-    weight = sd**-2.0
-    chi_square = float(np.sum(weight * (value - np.average(value, weights=weight)) ** 2))
-    freedom = len(pairs) - 1
+    chi_square, freedom = weighted_mean(*zip(*pairs, strict=True))[2], len(pairs) - 1
     quantile = float(stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975))
     return Widening(max(1.0, float(np.sqrt(chi_square / freedom))), quantile, len(pairs))
 

@@ -14,10 +14,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy import ndimage
 
-from capsule_id.experiments.context import RunRecord
 from capsule_id.inference.result import PointFit
 from capsule_id.parameters import QUANTILE_975
-from capsule_id.records.view import MotionView
+from capsule_id.records.view import MotionView, RunRecord
 from capsule_id.report.columns import SampledParameters, plain_symbol
 from capsule_id.report.figures.style import (
     BLACK,

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label
-from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.base import About, Experiment, Fitted, Start, ValuesBySymbol, axis_label
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable

@@ -9,7 +9,6 @@ from scipy import stats
 
 from capsule_id.inference.checks.posterior import (
     Distance,
-    RunsAlone,
     _by_sample,
     agreement,
     check_agreement,
@@ -21,6 +20,8 @@ from capsule_id.report.messages import FIT_MESSAGES, finding_text
 from capsule_id.views import Finding
 
 NAMES = ("k1", "c")
+#: u and its sd from the runs alone, by name.
+Alone = dict[str, tuple[float, float]]
 
 
 def words(found: Finding) -> str:
@@ -33,13 +34,13 @@ def fit(u: np.ndarray, covariance: np.ndarray) -> PointFit:
     return PointFit(NAMES, u, values, covariance, values, none, none, np.zeros(1), *np.zeros((2, 1), dtype=bool))
 
 
-def estimates(rng: np.random.Generator, shift: float) -> tuple[RunsAlone, PointFit]:
+def estimates(rng: np.random.Generator, shift: float) -> tuple[Alone, PointFit]:
     """Runs and bench, two linear experiments; the runs see the first parameter ``shift`` too high."""
     bench_cov = np.array([[4e-6, 1e-6], [1e-6, 9e-6]])
     runs_cov = np.array([[1e-6, -5e-7], [-5e-7, 2e-6]])
     one = rng.multivariate_normal(np.zeros(2), bench_cov)
     other = rng.multivariate_normal([shift, 0.0], runs_cov)
-    return RunsAlone(NAMES, other, runs_cov), fit(one, bench_cov)
+    return dict(zip(NAMES, zip(other, np.sqrt(np.diag(runs_cov)), strict=True), strict=True)), fit(one, bench_cov)
 
 
 def test_the_disagreement_is_standard_normal_where_there_is_none() -> None:
@@ -49,7 +50,7 @@ def test_the_disagreement_is_standard_normal_where_there_is_none() -> None:
     assert stats.kstest(z[:, 1], "norm").pvalue > 1e-3
 
 
-def _ordered(runs: RunsAlone, bench: PointFit) -> list[float]:
+def _ordered(runs: Alone, bench: PointFit) -> list[float]:
     found = disagreement(NAMES, runs, bench, None)
     return [found[name].z for name in NAMES]
 

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.kind import default_registry, make_experiments
-from capsule_id.inference.checks.posterior import RunsAlone, agreement, disagreement
+from capsule_id.inference.checks.posterior import agreement, disagreement
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.report.messages import FIT_MESSAGES, finding_text
@@ -93,8 +93,9 @@ def comparison(table: Table) -> Finding:
     names = tuple(alone.names[i] for i in alone.located)
     none = np.zeros(0)
     fit = PointFit(names, v, {}, other, {}, none, none, none, none, none)
-    found = RunsAlone(tuple(runs.names[i] for i in runs.located), u, covariance)
-    shared = [name for name in names if name in found.names]
+    sds = np.sqrt(np.diag(covariance))
+    found = {runs.names[i]: (u[k], sds[k]) for k, i in enumerate(runs.located)}
+    shared = [name for name in names if name in found]
     return agreement(disagreement(shared, found, fit, None), True, {name: [table.label] for name in shared})
 
 
