@@ -24,7 +24,6 @@ from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Shape,
-    any_rows,
     are_words,
     bare,
     cells_of,
@@ -32,8 +31,8 @@ from capsule_id.rig.formats.text import (
     is_row,
     number_in,
     place_of_cell,
-    plain_rows,
     read_column,
+    rows_of,
     shown_cell,
     texts_of,
 )
@@ -89,9 +88,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
-    rows = plain_rows(file, shape, wanted) if not words and are_words(layout.missing) else None
-    rows = rows or any_rows(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
-
+    rows = rows_of(file, shape, wanted, None, words) if are_words(layout.missing) else None
+    rows = rows or rows_of(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
+    assert rows is not None, "any cell is read with a list of markers"
     lines = rows.lines
 
     def place(row: int | None, column: int) -> Place:
