@@ -251,8 +251,8 @@ class Cycle:
 
     def mean(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean over one sampling step at ``places``, with a sample of every cycle, and its sd for unit noise."""
-        found = local_polynomials(self.phase, values, self.period, self.places, 0.5 * self.step, 0)
-        return found.value, found.sd
+        found, sd = local_polynomials(self.phase, values, self.period, self.places, 0.5 * self.step, 0)
+        return found[0], sd[0]
 
 
 def find_contacts(cycle: Cycle) -> Contacts:
@@ -267,10 +267,11 @@ def find_contacts(cycle: Cycle) -> Contacts:
     if push is None:
         spikes, z, single, levels = (), above[len(above) // 2], single / cycle.noise_sd, CROSSING_LEVELS[-1]
     else:
-        mean, sd = cycle.mean(push.shortfall)
-        z = mean / np.hypot(sd * push.sd, cycle.mean(push.shared_sd)[0])
+        shortfall, noise_sd, shared_sd = push
+        mean, sd = cycle.mean(shortfall)
+        z = mean / np.hypot(sd * noise_sd, cycle.mean(shared_sd)[0])
         spikes = tuple(len(intervals_above(z, *pair)) for pair in SPIKE_LEVELS)
-        single, levels = push.shortfall / np.hypot(push.sd, push.shared_sd), SPIKE_LEVELS[1]
+        single, levels = shortfall / np.hypot(noise_sd, shared_sd), SPIKE_LEVELS[1]
     stretches = intervals_above(z, *levels)
     single = np.convolve(single, np.full(_AVERAGED_SAMPLES, _AVERAGED_SAMPLES**-0.5), mode="same")
     agreeing, cycles = _agreeing_cycles(cycle, single, levels, stretches)
@@ -288,25 +289,16 @@ def find_contacts(cycle: Cycle) -> Contacts:
     return Contacts(count, spikes, crossings, seen, shortest or None, agreeing, cycles, reason)
 
 
-@dataclass(frozen=True)
-class _Shortfall:
-    """Linear law minus acceleration.
-
-    shortfall : (n,) m/s^2
-    sd : of its white noise, m/s^2
-    shared_sd : (n,) m/s^2, from the law and the smoothed x_rel in it; neighbours and periods share this error
-    """
-
-    shortfall: np.ndarray
-    sd: float
-    shared_sd: np.ndarray
+#: Linear law minus acceleration, (n,), the sd of its white noise, and (n,) the sd from the law and the smoothed x_rel in it,
+#: m/s^2; neighbours and periods share this error.
+Shortfall = tuple[np.ndarray, float, np.ndarray]
 
 
-def _shortfall(cycle: Cycle) -> _Shortfall | None:
+def _shortfall(cycle: Cycle) -> Shortfall | None:
     """Linear law minus acceleration; None without one that varies or without enough samples clear of contact."""
     if cycle.acceleration is None or np.ptp(cycle.acceleration) == 0.0:
         return None
-    wide = local_polynomials(
+    wide, _ = local_polynomials(
         cycle.phase,
         cycle.x_rel,
         cycle.period,
@@ -314,28 +306,28 @@ def _shortfall(cycle: Cycle) -> _Shortfall | None:
         max(_NARROW_HALF_WIDTH * cycle.step, _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega),
         3,
     )
-    clear = _clear_of_gap(cycle, wide.value)
+    clear = _clear_of_gap(cycle, wide[0])
     if clear.sum() < _SAMPLES_PER_UNKNOWN * _LINEAR_LAW_UNKNOWNS:
         return None
-    terms = _linear_law_terms(cycle, wide.value, wide.rate)[clear]
+    terms = _linear_law_terms(cycle, wide)[clear]
     scale = np.linalg.norm(terms, axis=0)
     q, triangle = np.linalg.qr(terms / scale)
     law = np.linalg.solve(triangle, q.T @ cycle.acceleration[clear]) / scale
     half = max(_NARROW_HALF_WIDTH, 0.5 * _NARROW_SAMPLES * cycle.period / (len(cycle.time) * cycle.step)) * cycle.step
-    near = local_polynomials(cycle.phase, cycle.x_rel, cycle.period, cycle.phase, half, 3)
-    terms = _linear_law_terms(cycle, near.value, near.rate)
+    near, near_sd = local_polynomials(cycle.phase, cycle.x_rel, cycle.period, cycle.phase, half, 3)
+    terms = _linear_law_terms(cycle, near)
     shortfall = terms @ law - cycle.acceleration
     # A step that exceeds the motion clear of contact hides the noise: what is left is the rounding.
     rounding = float(np.min(np.diff(np.unique(cycle.acceleration)))) / np.sqrt(12.0)
     sd = max(float(np.std(shortfall[clear])), rounding)
     of_law = sd * np.linalg.norm(np.linalg.solve(triangle.T, (terms / scale).T), axis=0)
-    of_terms = cycle.noise_sd * np.hypot(law[1] * near.sd, law[2] * near.rate_sd)
-    return _Shortfall(shortfall, sd, np.hypot(of_law, of_terms))
+    of_terms = cycle.noise_sd * np.hypot(law[1] * near_sd[0], law[2] * near_sd[1])
+    return shortfall, sd, np.hypot(of_law, of_terms)
 
 
-def _linear_law_terms(cycle: Cycle, x_rel: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def _linear_law_terms(cycle: Cycle, local: np.ndarray) -> np.ndarray:
     angle = cycle.Omega * cycle.time
-    return np.stack([np.ones_like(angle), x_rel, rate, np.cos(angle), np.sin(angle)], axis=1)
+    return np.stack([np.ones_like(angle), local[0], local[1], np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
@@ -350,10 +342,11 @@ def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
     return below & (distance > _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega)
 
 
-def _impact_line(cycle: Cycle, push: _Shortfall) -> ImpactLine | None:
+def _impact_line(cycle: Cycle, push: Shortfall) -> ImpactLine | None:
     """The x_rel at which the spikes vanish, by regression of x_rel on them."""
-    (force, sd), (x_rel, _) = cycle.mean(push.shortfall), cycle.mean(cycle.x_rel)
-    deep = force > _CONTACT_STANDARD_ERRORS * sd * push.sd
+    shortfall, noise_sd, shared = push
+    (force, sd), (x_rel, _) = cycle.mean(shortfall), cycle.mean(cycle.x_rel)
+    deep = force > _CONTACT_STANDARD_ERRORS * sd * noise_sd
     # A mean across an edge of a contact is biased: drop half a sampling step on either side.
     touching = np.all(
         [np.roll(deep, shift) for shift in range(-_PLACES_PER_SAMPLE // 2, _PLACES_PER_SAMPLE // 2 + 1)], axis=0
@@ -361,10 +354,10 @@ def _impact_line(cycle: Cycle, push: _Shortfall) -> ImpactLine | None:
     count = touching.sum() / _PLACES_PER_SAMPLE
     if count < _FEWEST_CONTACT_SAMPLES:
         return None
-    shared_sd = float(np.mean(cycle.mean(push.shared_sd)[0][touching]))
+    shared_sd = float(np.mean(cycle.mean(shared)[0][touching]))
     force, x_rel, sd = force[touching], x_rel[touching], sd[touching]
     # Noise in the regressor reduces the slope: subtract its known variance.
-    variance = float(np.var(force) - np.mean(sd**2) * push.sd**2)
+    variance = float(np.var(force) - np.mean(sd**2) * noise_sd**2)
     if variance <= 0.0:
         return None
     slope = float(np.mean((force - force.mean()) * (x_rel - x_rel.mean())) / variance)

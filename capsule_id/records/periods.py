@@ -17,16 +17,6 @@ from capsule_id.rig.filters import Record
 # The sampling step rarely divides the period. Ten periods at 1 kHz then give one period at 10 kHz.
 
 
-@dataclass(frozen=True)
-class Local:
-    """Local polynomials at (m,) places: value, rate per second, and their sd for unit noise."""
-
-    value: Float[np.ndarray, " m"]
-    rate: Float[np.ndarray, " m"]
-    sd: Float[np.ndarray, " m"]
-    rate_sd: Float[np.ndarray, " m"]
-
-
 def local_polynomials(
     phase: Record,
     values: Record,
@@ -34,8 +24,10 @@ def local_polynomials(
     places: Float[np.ndarray, " m"],
     half_width: float,
     order: int,
-) -> Local:
+) -> tuple[Float[np.ndarray, "q m"], Float[np.ndarray, "q m"]]:
     """Least-squares polynomials over windows of a folded record, the folded Savitzky–Golay filter.
+
+    Returns their coefficients at the places, value and rate per second first, and the sds of these for unit noise.
 
     Parameters
     ----------
@@ -44,7 +36,7 @@ def local_polynomials(
     period : s
     places : (m,) s, where the polynomials are evaluated
     half_width : of the window, s; the window is half open and holds at least ``order`` + 1 different phases
-    order : of the polynomial; with 0 the value is a mean and the rate is 0
+    order : of the polynomial, q - 1; with 0 the value is a mean
     """
     sort = np.argsort(phase)
     axis = (phase[sort] + period * np.array([-1.0, 0.0, 1.0])[:, None]).ravel()
@@ -59,10 +51,8 @@ def local_polynomials(
     inverse = np.linalg.inv(np.einsum("mkp,mkq->mpq", design, design))
     weights = np.einsum("mpq,mkq->mpk", inverse, design)
     unknowns = np.einsum("mpk,mk->mp", weights, np.where(inside, y[index], 0.0))
-    none = np.zeros(len(places))
-    rate = unknowns[:, 1] / half_width if order else none
-    rate_sd = np.sqrt(inverse[:, 1, 1]) / half_width if order else none
-    return Local(unknowns[:, 0], rate, np.sqrt(inverse[:, 0, 0]), rate_sd)
+    unit = half_width ** np.arange(order + 1)[:, None]
+    return unknowns.T / unit, np.sqrt(np.einsum("mpp->pm", inverse)) / unit
 
 
 def intervals_above(z: Record, low: float, high: float) -> list[tuple[int, int]]:

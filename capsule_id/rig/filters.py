@@ -177,12 +177,23 @@ def choose_window(time: Record, values: Record, order: int) -> float:
         As ``savitzky_golay``.
     """
     step = sampling_step(time)
-    frequency = dominant_frequency(time, values) * step
-    windows = range(order + 1 + order % 2, len(time) + 1, 2)
-    _check_window(windows.start, order, len(time))
+    _check_window(order + 1 + order % 2, order, len(time))
+    return longest_window(dominant_frequency(time, values) * step, len(time), order, SMALLEST_GAIN) * step
+
+
+def longest_window(frequency: float, most: int, order: int, gain: float, derivative: int = 0) -> int:
+    """Samples of the longest odd window with at least this ``gain`` at a frequency; else of the shortest one that smooths.
+
+    Parameters
+    ----------
+    frequency : cycles per sample
+    most : samples of the record
+    order, derivative : as in ``filter_gain``
+    """
+    windows = range(order + 1 + order % 2, most + 1, 2)
     # The gain falls monotonically from 1 to the stop band, whose ripple is far below 1.
-    too_long = bisect_left(windows, 1, 1, key=lambda samples: filter_gain(frequency, samples, order) < SMALLEST_GAIN)
-    return windows[too_long - 1] * step
+    too_long = bisect_left(windows, 1, 1, key=lambda samples: filter_gain(frequency, samples, order, derivative) < gain)
+    return windows[too_long - 1]
 
 
 def dominant_frequency(time: Record, values: Record) -> float:
