@@ -13,12 +13,11 @@ from capsule_id.experiments.kind import Kind, default_registry
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples
 from capsule_id.records.release import find_free_decay
-from capsule_id.records.tones import estimate_clock
-from capsule_id.rig.filters import clock_starts, dominant_frequency
+from capsule_id.records.tones import estimate_clock, frequency_of
+from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats.layouts import delimiter_of
 from capsule_id.rig.formats.raw import Layout, TextFile
 from capsule_id.rig.guess import (
-    FEWEST_SAMPLES,
     TIME,
     Assignment,
     ColumnGuess,
@@ -36,7 +35,7 @@ from capsule_id.rig.guess import (
     unit_of,
     used_layout,
 )
-from capsule_id.rig.schema import QuantityRule
+from capsule_id.rig.schema import SHORTEST_RECORD, QuantityRule
 from capsule_id.rig.units import UNKNOWN, factor_to_si
 from capsule_id.views import counted
 
@@ -181,7 +180,7 @@ def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess]
 def _is_record(found: FoundLayout, time: int | None) -> bool:
     """Whether a file is a record in time: long enough, with increasing times."""
     rows = len(next(iter(found.columns.values())))
-    return rows >= FEWEST_SAMPLES if time is None else rows >= 8 and increases(found.columns[time])
+    return rows >= FEWEST_SAMPLES if time is None else rows >= SHORTEST_RECORD and increases(found.columns[time])
 
 
 def _by_motion(found: FoundLayout, leading: list[Assignment]) -> tuple[Assignment, Confidence, str] | None:
@@ -255,10 +254,7 @@ def are_turning_points(values: np.ndarray) -> bool:
 
 def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None] | None:
     """Start and stop of the free decay in a record, s; None where all of it is free or nothing swings."""
-    try:
-        decay = find_free_decay(time, values)
-    except InputError:
-        return None
+    decay = find_free_decay(time, values)
     if decay is None or np.any(np.diff(time) <= 0.0) or (decay.rest == 0.0 and decay.stop is None):
         return None
     return decay.start, decay.end
@@ -438,12 +434,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
         if stop is not None:
             yield _commented(f'stop = {{ value = {stop:.6g}, unit = "s" }}', "likely", "another excitation begins here")
     if driven:
-        even = np.linspace(time[0], time[-1], len(time))
-        try:
-            frequency = dominant_frequency(even, np.interp(even, time, values))
-        except InputError:
-            return
-        line = f'f = {{ value = {frequency:.4g}, unit = "Hz" }}'
+        line = f'f = {{ value = {frequency_of(time, values):.4g}, unit = "Hz" }}'
         yield _commented(line, "unsure", f"the strongest frequency of {channel}; state the set value")
 
 

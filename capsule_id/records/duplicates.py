@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from capsule_id.records.tones import noise_level
-from capsule_id.rig.filters import PIECE, thinned
+from capsule_id.rig.filters import FEWEST_SAMPLES, PIECE, thinned
+from capsule_id.rig.model import SAME
 
 # duplicates: Finds readings that occur twice: equal tables, and equal blocks of rows within or across tables.
 #
@@ -19,8 +20,8 @@ from capsule_id.rig.filters import PIECE, thinned
 CHANCE = 1e-6
 #: Chance of equal rows above which only equal tables count as repeated.
 COARSE = 0.5
-#: Shortest block of a record, samples; shortest record whose noise level is estimated.
-SHORTEST_BLOCK, SHORTEST_RECORD = 8, 50
+#: Shortest block of a record, samples.
+SHORTEST_BLOCK = 8
 #: Width of a scatter, in standard deviations; scatter of a table of single readings, relative to its range.
 WIDTH, TABLE_SCATTER = 3.5, 0.01
 #: Rows that are compared at a time.
@@ -71,8 +72,8 @@ def reading_step(values: np.ndarray) -> float:
     values = thinned(values)
     levels = np.unique(values)
     gaps = np.diff(levels)
-    gaps = gaps[gaps > 1e-9 * scale]
-    most = MOST_LEVELS if len(values) < SHORTEST_RECORD else MOST_LEVELS_OF_RECORD
+    gaps = gaps[gaps > SAME * scale]
+    most = MOST_LEVELS if len(values) < FEWEST_SAMPLES else MOST_LEVELS_OF_RECORD
     if 2 < len(gaps) < most * len(values):
         spacing = float(np.median(gaps[gaps < 1.5 * np.min(gaps)]))
         if np.mean(np.abs(gaps / spacing - np.round(gaps / spacing)) < LEVEL_TOLERANCE) > REGULAR_LEVELS:
@@ -90,7 +91,7 @@ def chance_of_equality(readings: Readings) -> float:
     for values, factor in zip(readings.values.T, factors, strict=True):
         # A step of 0.1 deg is a decimal one in deg alone.
         step, width = reading_step(factor * thinned(values)) / factor, TABLE_SCATTER * float(np.ptp(values))
-        if readings.record and len(values) >= SHORTEST_RECORD:
+        if readings.record and len(values) >= FEWEST_SAMPLES:
             step, width = max(step, _uneven_spacing(values, step)), WIDTH * noise_level(values)
         # A step of 0 is that of float64.
         own = min(1.0, max(step, 4e-16 * float(np.max(np.abs(values)))) / width) if width > 0.0 else 1.0

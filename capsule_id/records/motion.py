@@ -11,6 +11,7 @@ from scipy.stats import norm
 from capsule_id.errors import InputError
 from capsule_id.records.periods import (
     DECIDED,
+    VISIBLE,
     Repeat,
     find_period,
     first_true,
@@ -19,6 +20,7 @@ from capsule_id.records.periods import (
     period_word,
 )
 from capsule_id.records.tones import (
+    BEYOND_CHANCE,
     Harmonic,
     fit_harmonic,
     recorded_drive,
@@ -41,7 +43,6 @@ _MOST_HARMONICS = 24  # of the motion's frequency in the periodic part of X2
 _SAMPLES_PER_VELOCITY = 4  # at least
 _ADVANCES = 2000  # values of the advance, for the integrals of the probabilities
 _ROUNDING = 1e-3  # smallest standard error of an advance, of the largest one of a standing capsule
-_SIGNIFICANT = 3.0  # standard deviations of the noise's own variance; larger scatter of the advances counts
 
 
 @dataclass(frozen=True)
@@ -134,12 +135,12 @@ def _scatter_of_advances(time: Record, places: Record, T: float, variance: float
     counts = np.bincount(number)
     whole = counts[:-1] > 0
     means = (np.bincount(number, places)[:-1] / np.maximum(counts[:-1], 1))[whole]
-    if len(means) < 3:
-        return 0.0
     advances = np.diff(means)
+    if len(advances) < 2:
+        return 0.0
     noise = 2.0 * variance / float(np.mean(counts[:-1]))
     found = float(np.var(advances, ddof=1))
-    if found < noise * (1.0 + _SIGNIFICANT * np.sqrt(3.0 / len(advances))):
+    if found < noise * (1.0 + VISIBLE * np.sqrt(3.0 / len(advances))):
         return 0.0
     return float(np.sqrt((found - noise) / len(advances)) / T)
 
@@ -175,12 +176,10 @@ _NARROW_SAMPLES = 9  # samples of the folded record in the narrow window, at lea
 _WIDE_HALF_WIDTH = 0.02  # of the excitation period, half-width for the linear law: rates with little noise
 _CLEARANCE_SHARE = 0.05  # of the range of x_rel: samples this far below the gap are clear of contact,
 _CLEARANCE_SDS = 5.0  # and this many sd of the stated gap below it
-_CONTACT_STANDARD_ERRORS = 6.0  # standard errors; larger spikes determine the impact line
 _IMPACT_LINE_SHIFTS = (-2.0, 0.0, 2.0)  # sd; crossings are counted at the impact line shifted by these
 _FEWEST_CONTACT_SAMPLES = 2  # of the folded record in contact, needed for the impact line
 _SAMPLES_PER_UNKNOWN = 10  # samples per unknown of the linear law
 _AVERAGED_SAMPLES = 3  # samples of the moving mean in single periods; a contact lasts longer
-_LINEAR_LAW_UNKNOWNS = 5  # unknowns of the linear law
 _ODDS_OF_A_CYCLE = 3.0  # that a single period shows the true number of contacts
 
 
@@ -307,9 +306,9 @@ def _shortfall(cycle: Cycle) -> Shortfall | None:
         3,
     )
     clear = _clear_of_gap(cycle, wide[0])
-    if clear.sum() < _SAMPLES_PER_UNKNOWN * _LINEAR_LAW_UNKNOWNS:
-        return None
     terms = _linear_law_terms(cycle, wide)[clear]
+    if len(terms) < _SAMPLES_PER_UNKNOWN * terms.shape[1]:
+        return None
     scale = np.linalg.norm(terms, axis=0)
     q, triangle = np.linalg.qr(terms / scale)
     law = np.linalg.solve(triangle, q.T @ cycle.acceleration[clear]) / scale
@@ -346,7 +345,7 @@ def _impact_line(cycle: Cycle, push: Shortfall) -> ImpactLine | None:
     """The x_rel at which the spikes vanish, by regression of x_rel on them."""
     shortfall, noise_sd, shared = push
     (force, sd), (x_rel, _) = cycle.mean(shortfall), cycle.mean(cycle.x_rel)
-    deep = force > _CONTACT_STANDARD_ERRORS * sd * noise_sd
+    deep = force > BEYOND_CHANCE * sd * noise_sd
     # A mean across an edge of a contact is biased: drop half a sampling step on either side.
     touching = np.all(
         [np.roll(deep, shift) for shift in range(-_PLACES_PER_SAMPLE // 2, _PLACES_PER_SAMPLE // 2 + 1)], axis=0

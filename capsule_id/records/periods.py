@@ -104,12 +104,14 @@ PERIODIC_SCATTER, APERIODIC_SCATTER, PART = (0.003, 0.06), (0.02, 1.0), (0.003, 
 COMMON_SCATTER, SCATTER_EXPONENT = 0.015, 3.0
 #: Largest number of bands of an aperiodic motion, visited in turn.
 MOST_BANDS = 4
-#: A period is decided only where noise and scatter hide no larger part of another one than this.
-LARGEST_HIDDEN = 0.02
+#: A period is decided only where noise and scatter hide no larger part of another one than this: it could be the scatter of
+#: an aperiodic motion.
+LARGEST_HIDDEN = APERIODIC_SCATTER[0]
 #: Correlations of the scatter of successive cycles.
-CORRELATIONS = np.linspace(-0.6, 0.6, 5)
+CORRELATIONS = 0.6 * np.linspace(-1.0, 1.0, 5)
+#: Standard errors of a variance above which what it exceeds is visible.
+VISIBLE = 3.0
 _HIGHEST_DEGREE = 16  # of the polynomial over a cycle; a high degree on few samples amplifies their noise
-_STANDARD_ERRORS = 3.0  # of the power of the scatter at one frequency; a larger part is visible
 _GRID = 25  # standard deviations per range
 _DIFFERENCE_ORDER = 6  # of the differences for the noise level; the motion vanishes in them
 _CYCLES_PER_DRIFT_TERM = 4  # of the polynomial drift, at most quadratic
@@ -261,7 +263,7 @@ class _Evidence:
     def hidden(self, n: int) -> float:
         """Largest part of another period that the noise and the scatter of period n hide, rms."""
         variance = self._noise + self.scatter(n) ** 2
-        return float(np.sqrt(variance * _STANDARD_ERRORS * np.sqrt(2.0 / self._independent) / len(self._cycles)))
+        return float(np.sqrt(variance * VISIBLE * np.sqrt(2.0 / self._independent) / len(self._cycles)))
 
     def scatter(self, n: int) -> float:
         """rms difference of a cycle from the motion of period n beyond the noise, drift removed."""

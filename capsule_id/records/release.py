@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from capsule_id.records.tones import frequency_of, noise_level
+from capsule_id.records.tones import SIGNIFICANT, frequency_of, noise_level
 from capsule_id.rig.filters import PIECE, loudest_part
 
 #: Turning points differ by this fraction of the record's range, and by so many standard deviations of the noise.
@@ -19,8 +19,8 @@ STEEP, STEEP_TIME = 0.3, 0.097
 PAST = 0.8
 #: Samples in a period that suffice; of more, means are taken. Fewest of them, and fewest in a window.
 SAMPLES, FEWEST, WINDOW = 100, 4.0, 28
-#: The motion ends where it stays so close to its last value: fraction of the range, standard deviations of the noise.
-STILL, STILL_SDS = 0.015, 4.0
+#: The motion ends where it stays so close to its last value, as a fraction of the range, or closer than the noise.
+STILL = 0.015
 #: Prior sds of dry friction, quadratic damping and a cubic spring, relative to the spring force at the amplitude.
 FURTHER = np.array([0.1, 0.2, 0.1])
 #: Error of the model relative to the amplitude, and what it gains with the sum of the further forces, up to a largest sum.
@@ -241,7 +241,7 @@ class _Record:
         size = max(min(int(period / np.median(np.diff(time)) / SAMPLES), len(time) // WINDOW), 1)
         time, values = (a[: len(a) // size * size].reshape(-1, size).mean(axis=1) for a in (time, values))
         noise, last = noise_level(values), np.median(values[-max(5, len(values) // 20) :])
-        far = np.flatnonzero(np.abs(values - last) > max(STILL_SDS * noise, STILL * float(np.ptp(values))))
+        far = np.flatnonzero(np.abs(values - last) > max(SIGNIFICANT * noise, STILL * float(np.ptp(values))))
         anchor = min(int(np.searchsorted(time, past)), max(len(time) - 10, 0))
         end = max(far[-1] + 1 if len(far) else 0, anchor + 12)
         return cls(time[:end], values[:end], period, noise), anchor
@@ -383,7 +383,7 @@ def _whole(
         omega, zeta = omega * float(np.exp(step[0])), float(np.clip(zeta + step[1], 1e-6, OSCILLATES))
     left = (values - projection.Q @ (projection.Q.T @ values)) / record.noise
     squares, few = np.cumsum(left**2), slice(len(left) // 2)
-    if squares[-1] > len(left) + 4.0 * np.sqrt(2.0 * len(left)) or np.max(np.abs(step)) > 0.01:
+    if squares[-1] > len(left) + SIGNIFICANT * np.sqrt(2.0 * len(left)) or np.max(np.abs(step)) > 0.01:
         return None
     q = projection.Q[few]
     own, shared = np.cumsum(q * left[few, None], axis=0), np.cumsum(q[:, :, None] * q[:, None, :], axis=0)
@@ -484,7 +484,7 @@ def _earlier(record: _Record, row: int, fit: _Fit) -> tuple[float, float | None]
         part = slice(record.at(end - 2.0 * period), record.at(end))
         values, stays = record.values[part], end - time[part.start] > EARLIER * period
         ends_here = end > time[row] - period
-        if len(values) < 6 or np.ptp(values) < 2.0 * STILL_SDS * record.noise or not (stays or ends_here):
+        if len(values) < 6 or np.ptp(values) < 2.0 * SIGNIFICANT * record.noise or not (stays or ends_here):
             continue
         poles = record.fit(part.start, part.stop, [fit.poles], 4).poles if stays else fit.poles
         columns = _motions(poles[0] * (time[part] - end), poles[1])[0]

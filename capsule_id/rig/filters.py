@@ -23,6 +23,8 @@ Record = Num[np.ndarray, " n"]
 TIMING_TOLERANCE = 0.01  # largest distance from an even grid, in sampling steps, of evenly spaced samples
 SMALLEST_GAIN = 0.99  # smallest gain of `choose_window` at the dominant frequency
 _HAMPEL_BLOCK = 2_000_000  # readings that are sorted at a time
+#: Fewest samples that show the noise, the levels and the frozen parts of a record; fewer may be single readings.
+FEWEST_SAMPLES = 50
 PIECE = 1 << 18  # samples that are looked at together of a record with twice as many or more
 #: Fewest periods in the loudest part of a record from which its frequency is read.
 FEWEST_PERIODS = 8.0

@@ -9,6 +9,7 @@ import numpy as np
 
 from capsule_id.rig.filters import hampel_outliers, median_step
 from capsule_id.rig.formats.raw import Place, RawTable
+from capsule_id.rig.model import SAME
 from capsule_id.rig.schema import ChoiceRule, KindRule, PlainRule, SettingRule, read_rules
 from capsule_id.rig.toml import Node, is_number, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
@@ -76,7 +77,7 @@ def without_outliers(node: Node, raw: RawTable, times: Callable[[RawTable], np.n
     time = times(raw)
     step = median_step(time) if len(time) > 1 else np.inf
     half = stated["window"] / step / 2.0
-    if not 1.0 - 1e-9 <= half <= len(time) / 2.0:
+    if not 1.0 - SAME <= half <= len(time) / 2.0:
         raise node["window"].error(
             "the window must hold two sampling steps or more, and fit into the record",
             f"{stated['window']:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s",

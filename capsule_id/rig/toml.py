@@ -15,7 +15,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.parameters import Prior
-from capsule_id.rig.model import Quantity
+from capsule_id.rig.model import ROUNDING, Quantity
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 # domains: Intervals of admissible values.
@@ -37,7 +37,8 @@ class Domain:
 
 
 #: Magnitudes of quantities that a rig may have, SI: their squares and ratios stay far from the limits of float64.
-SMALLEST, LARGEST = 1e-30, 1e30
+LARGEST = 1e30
+SMALLEST = 1.0 / LARGEST
 
 
 def is_plausible(values: np.ndarray | float) -> np.ndarray:
@@ -50,7 +51,7 @@ ANY = Domain("be a finite number")
 POSITIVE = Domain("be greater than 0", low=0.0)
 NOT_NEGATIVE = Domain("be 0 or greater", low=0.0, low_allowed=True)
 #: A share, both ends included: the bound lies a rounding error of unit conversion above 1.
-SHARE = Domain("lie between 0 and 100 %", low=0.0, high=1.0 + 1e-12, low_allowed=True)
+SHARE = Domain("lie between 0 and 100 %", low=0.0, high=1.0 + ROUNDING, low_allowed=True)
 ABOVE_ONE = Domain("be greater than 1", low=1.0)
 #: A number of drive periods; the simulation of more takes minutes for each trial.
 PERIODS = Domain("lie between 1 and 100000", low=1.0, high=1e5 + 0.5, low_allowed=True)

@@ -273,7 +273,11 @@ def are_words(missing: Sequence[str]) -> bool:
 
 
 def rows_of(
-    file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str] | None = None, words: Sequence[int] = ()
+    file: TextFile,
+    shape: Shape,
+    columns: Sequence[int],
+    missing: Sequence[str] | None = None,
+    words: Sequence[int] = (),
 ) -> Rows | None:
     """The rows of a text, with NaN at a missing marker, and the texts of the columns ``words``.
 
