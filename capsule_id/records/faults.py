@@ -9,6 +9,7 @@ from numpy.polynomial import polynomial
 from scipy import ndimage, signal
 from scipy.optimize import least_squares
 
+from capsule_id.records.duplicates import ROUNDING as EPSILON
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.tones import BEYOND_CHANCE, ORDER, SIGNIFICANT, noise_level
 from capsule_id.rig.filters import FEWEST_SAMPLES, TIMING_TOLERANCE, largest_offset, median_step, thinned
@@ -219,7 +220,7 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
         # Readings with so many significant digits have finer steps near zero than at a limit.
         large = few[few / limit >= LARGE_JUMP] if limit else few
         step = reading_step(large if len(large) >= FEWEST_LARGE else few)
-        tolerance = max(0.25 * step, 4e-16 * max(abs(limit) for limit in limits))
+        tolerance = max(0.25 * step, EPSILON * max(abs(limit) for limit in limits))
         depth = sign * (limit - values)
         rows = np.flatnonzero(depth <= tolerance)
         near = np.flatnonzero((depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step))

@@ -14,7 +14,8 @@ TURN, TURN_SDS = 0.12, 5.0
 #: The last leg between turning points that has this fraction of the largest one belongs to the free decay.
 LEG = 0.3
 #: The part of a leg whose steepest place gives the period, and the time that a cosine takes for it, in periods.
-STEEP, STEEP_TIME = 0.3, 0.097
+STEEP = 0.3
+STEEP_TIME = np.arcsin(STEEP) / np.pi
 #: Where the leg has passed this fraction of its height, the release is past.
 PAST = 0.8
 #: Samples in a period that suffice; of more, means are taken. Fewest of them, and fewest in a window.

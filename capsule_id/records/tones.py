@@ -58,7 +58,7 @@ def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
 
 
 #: Median of |z| for a standard normal z.
-NORMAL_QUARTILE = 0.6745
+NORMAL_QUARTILE = float(stats.halfnorm.median())
 #: Order of the differences that remove a well-sampled decay.
 ORDER = 3
 #: Standard deviations, or standard errors, that a single value exceeds by chance once in 16,000 times, and that no sample

@@ -91,11 +91,8 @@ def clock_starts(time: Record) -> Int[np.ndarray, " k"]:
 
 
 def median_step(time: Record) -> float:
-    """The median of the steps, s; of a long record that of as many steps as a piece has, at equal distances."""
-    if len(time) < 2 * PIECE:
-        return float(np.median(np.diff(time)))
-    first = np.arange(0, len(time) - 1, len(time) // PIECE)
-    return float(np.median(time[first + 1] - time[first]))
+    """The median of the steps, s."""
+    return float(np.median(np.diff(time)))
 
 
 def largest_offset(time: Record, step: float) -> float:
