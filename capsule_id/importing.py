@@ -288,7 +288,7 @@ def propose_entry(file: str | Path) -> str:
         If the file cannot be read.
     """
     path = Path(file)
-    return entry_of(read_file(path), path, path.name, default_registry())[0]
+    return entry_of(read_file(path), path, default_registry())[0]
 
 
 def read_file(path: Path) -> bytes:
@@ -312,13 +312,12 @@ def read_file(path: Path) -> bytes:
         raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None
 
 
-def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
+def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
     """The lines of ``[[experiment]]`` for one export, and the guess; without a guess the lines are comments.
 
     Parameters
     ----------
-    content, path : the bytes of the file, and its name for error lines
-    file : its name in ``rig.toml``
+    content, path : the bytes of the file, and its path; ``rig.toml`` names it without the folder
     kinds : the kinds of experiments
 
     Raises
@@ -328,12 +327,12 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
     """
     found = find_layout(content, path, dimensions_of(kinds))
     guessed = guess(found, kinds)
-    return _entry(found, guessed, content, file, kinds), guessed
+    return _entry(found, guessed, content, kinds), guessed
 
 
-def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, file: str, kinds: Mapping[str, Kind]) -> str:
+def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Mapping[str, Kind]) -> str:
     """The lines of ``[[experiment]]`` for an export with its guess."""
-    unread = list(_unread_lines(found, dimensions_of(kinds)))
+    unread, file = list(_unread_lines(found, dimensions_of(kinds))), found.export.path.name
     if guessed is None:
         words = " ".join(kinds)
         headers = ", ".join(name for name in found.names if name) or "none"
@@ -360,7 +359,7 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, file: str,
     lines = [*unread, "[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
-    lines += _setting_lines(found, guessed, kind, file)
+    lines += _setting_lines(found, guessed, kind)
     lines += ["[experiment.columns]", *_column_lines(found, guessed)]
     return "\n".join(lines) + "\n"
 
@@ -406,10 +405,12 @@ def _layout_lines(found: FoundLayout, used: Layout) -> Iterable[str]:
             yield _commented(f"{key} = {json.dumps(value, ensure_ascii=False)}", confidence, reason)
 
 
-def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) -> Iterable[str]:
+def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
     """Settings that the record or the name of the file suggests."""
     for key in kind.required:
-        stem = "".join(mark if mark.isalnum() or mark in "._-" else "_" for mark in Path(file).name.split(".")[0])
+        stem = "".join(
+            mark if mark.isalnum() or mark in "._-" else "_" for mark in found.export.path.name.split(".")[0]
+        )
         yield _commented(f'{key} = "{stem}"', "unsure", "from the name of the file")
     constant = _constant_settings(found, guessed, kind)
     yield from constant.values()
@@ -518,7 +519,7 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
     for row in [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]:
         cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
         lines.append(f"line {found.export.lines[row]}: {'  '.join(cells)}")
-    return [*lines, "", _entry(found, guessed, content, path.name, kinds).rstrip()]
+    return [*lines, "", _entry(found, guessed, content, kinds).rstrip()]
 
 
 def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:
@@ -569,7 +570,7 @@ def _sampling(time: np.ndarray) -> Iterable[str]:
         yield f"sampling: the times do not increase at {counted(int(np.sum(steps <= 0.0)), 'row')}"
         return
     step = float(np.median(steps))
-    jitter = float(np.sqrt(np.mean((steps[steps < 1.5 * step] / step - 1.0) ** 2)))
+    jitter = float(np.sqrt(np.mean((steps[np.round(steps / step) < 2.0] / step - 1.0) ** 2)))
     yield f"sampling: {1.0 / step:.6g} Hz from {time[0]:.6g} to {time[-1]:.6g} s, jitter {jitter:.2%} of a step (rms)"
     gaps = find_gaps(time)
     if gaps is not None:

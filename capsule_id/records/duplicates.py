@@ -76,7 +76,7 @@ def reading_step(values: np.ndarray) -> float:
     gaps = gaps[gaps > SAME * scale]
     most = MOST_LEVELS if len(values) < FEWEST_SAMPLES else MOST_LEVELS_OF_RECORD
     if 2 < len(gaps) < most * len(values):
-        spacing = float(np.median(gaps[gaps < 1.5 * np.min(gaps)]))
+        spacing = float(np.median(gaps[np.round(gaps / np.min(gaps)) < 2.0]))
         if np.mean(np.abs(gaps / spacing - np.round(gaps / spacing)) < LEVEL_TOLERANCE) > REGULAR_LEVELS:
             return spacing
     first = -int(np.floor(np.log10(scale)))

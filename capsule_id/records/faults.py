@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from capsule_id.records.duplicates import ROUNDING as EPSILON
 from capsule_id.records.duplicates import reading_step
-from capsule_id.records.tones import BEYOND_CHANCE, ORDER, SIGNIFICANT, noise_level
+from capsule_id.records.tones import AS_GOOD, BEYOND_CHANCE, ORDER, SIGNIFICANT, noise_level
 from capsule_id.rig.filters import FEWEST_SAMPLES, TIMING_TOLERANCE, largest_offset, median_step, thinned
 from capsule_id.rig.schema import SHORTEST_RECORD
 
@@ -22,8 +22,6 @@ from capsule_id.rig.schema import SHORTEST_RECORD
 
 #: Fewest and most multiples of the sampling rate that are tried; damping rates that are tried, per sampled period.
 MULTIPLES, MOST_MULTIPLES, RATES = 5, 200, np.geomspace(1e-3, 1.0, 13)
-#: Another frequency fits as well where its sum of squares is below this multiple.
-AS_WELL = 1.5
 #: Steps of the time that differ less than this from the median, relative, are usual ones.
 USUAL_STEP = 0.2
 #: Most decimal places, and most significant digits, of rounded times. Samples that are looked at: they show as much as a
@@ -73,7 +71,7 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: flo
     others = np.array([min(misfit(other + k * step, damping) for k in NEAR) for other in candidates])
     candidates, others = candidates[order := np.argsort(others)], others[order]
     others[:REFINED] = [best(other, damping)[0] for other in candidates[:REFINED]]
-    return candidates[others <= AS_WELL * least + 1e-12 * float(np.sum(values**2))]
+    return candidates[others <= AS_GOOD * least + 1e-12 * float(np.sum(values**2))]
 
 
 def sampling(time: np.ndarray) -> tuple[float, bool]:

@@ -42,7 +42,6 @@ CONFIDENCE = 0.99
 _MOST_HARMONICS = 24  # of the motion's frequency in the periodic part of X2
 _SAMPLES_PER_VELOCITY = 4  # at least
 _ADVANCES = 2000  # values of the advance, for the integrals of the probabilities
-_ROUNDING = 1e-3  # smallest standard error of an advance, of the largest one of a standing capsule
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,6 @@ def _probabilities(advance: float, sd: float, largest: float) -> dict[str, float
     """Posterior probability of each direction, given the advance per period and its standard error, m."""
     if not np.isfinite(sd):
         return dict.fromkeys("FBS", 1.0 / 3.0)
-    sd = max(sd, _ROUNDING * STANDING_ADVANCE)
     moving = np.geomspace(STANDING_ADVANCE, max(largest, 2.0 * STANDING_ADVANCE, 2.0 * abs(advance)), _ADVANCES)
     standing = np.linspace(-STANDING_ADVANCE, STANDING_ADVANCE, _ADVANCES)
     logs = {

@@ -96,10 +96,11 @@ FEWEST_APERIODIC = LONGEST_PERIOD + 2
 DECIDED = 0.9
 #: Prior probability of an aperiodic motion. That of the period n falls as n to this power.
 APERIODIC_PRIOR, PERIOD_EXPONENT = 0.07, -3.0
-#: Ranges of standard deviations with log-uniform priors: cycle-to-cycle scatter of period 1 and of an aperiodic motion,
-#: and the part that repeats after n cycles only. A smaller part counts as a repeat. The largest scatter of period n is
-#: n times smaller: scatter hides the fine bands of long periods.
-PERIODIC_SCATTER, APERIODIC_SCATTER, PART = (0.003, 0.06), (0.02, 1.0), (0.003, 1.0)
+#: Ranges of standard deviations with log-uniform priors: the part that repeats after n cycles only, and the cycle-to-cycle
+#: scatter of period 1 and of an aperiodic motion. A smaller part counts as a repeat, so smaller scatter is no matter. The
+#: largest scatter of period n is n times smaller: scatter hides the fine bands of long periods.
+PART, APERIODIC_SCATTER = (0.003, 1.0), (0.02, 1.0)
+PERIODIC_SCATTER = (PART[0], 0.06)
 #: Largest scatter of most periodic records; above it the prior falls with this power.
 COMMON_SCATTER, SCATTER_EXPONENT = 0.015, 3.0
 #: Largest number of bands of an aperiodic motion, visited in turn.

@@ -64,6 +64,8 @@ ORDER = 3
 #: Standard deviations, or standard errors, that a single value exceeds by chance once in 16,000 times, and that no sample
 #: of a long record does: once in 5e8.
 SIGNIFICANT, BEYOND_CHANCE = 4.0, 6.0
+#: A fit counts as good as the best one if it leaves at most this many times its sum of squares.
+AS_GOOD = 1.5
 #: Part of the energy of a decay before it is all noise.
 ENERGY = 0.99
 
@@ -292,9 +294,8 @@ FEWEST_COMMON = FEWEST_SAMPLES
 LEAST_EXPLAINED = 0.5
 #: A component of the spectrum counts as signal above this many times the mean power of the noise.
 ABOVE_NOISE = 8.0
-#: Peaks of the correlation above this fraction of the largest one are tried; a fit counts as good as the best one if it
-#: leaves at most this many times its variance unexplained.
-LARGE, AS_GOOD = 0.5, 1.5
+#: Peaks of the correlation above this fraction of the largest one are tried.
+LARGE = 0.5
 _MOST_STARTS, _SAMPLES_OF_A_TRIAL = 8, 3000
 #: Most points of the grid on which a first offset is searched.
 _GRID = 1 << 18
