@@ -44,9 +44,9 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: flo
     time, values = time[:SAMPLES], values[:SAMPLES]
     (rate, even), elapsed = sampling(time), time - time[0]
     number = np.clip(int((highest + frequency) / rate) + 2, MULTIPLES, MOST_MULTIPLES)
-    multiples = np.arange(1, number + 1) * rate
+    multiples = np.delete(np.arange(-number, number + 1), number) * rate
     if even:
-        return np.unique(np.abs(np.concatenate([multiples - frequency, multiples + frequency])))
+        return np.unique(np.abs(multiples + frequency))
 
     def rest(f: float, damping: float) -> np.ndarray:
         """(n,) residuals beside a tone of this frequency, Hz, with this damping rate, 1/s."""
@@ -66,7 +66,7 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: flo
     # The best of the steps leaves a misfit that hides what another frequency does not explain.
     step, size = PHASE / elapsed[-1], float(np.std(values)) or 1.0
     least, frequency, damping = best(frequency, min(RATES * frequency, key=lambda rate: misfit(frequency, rate)))
-    candidates = np.unique(np.abs(np.concatenate([multiples - frequency, multiples + frequency])))
+    candidates = np.unique(np.abs(multiples + frequency))
     # The jitter of the times leaves an error of the sampling rate.
     others = np.array([min(misfit(other + k * step, damping) for k in NEAR) for other in candidates])
     candidates, others = candidates[order := np.argsort(others)], others[order]

@@ -5,7 +5,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 from scipy.stats import norm
 
 from capsule_id.errors import InputError
@@ -103,8 +103,7 @@ def _probabilities(advance: float, sd: float, largest: float) -> dict[str, float
             ("S", standing, np.gradient(standing)),
         )
     }
-    total = float(np.asarray(logsumexp(list(logs.values()))))
-    return {word: float(np.exp(value - total)) for word, value in logs.items()}
+    return dict(zip(logs, softmax(list(logs.values())).tolist(), strict=True))
 
 
 def _slope_with_harmonics(time: Record, values: Record, T: float) -> tuple[float, float]:

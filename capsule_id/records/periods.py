@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
 from capsule_id.records.tones import noise_level
 from capsule_id.rig.filters import Record
@@ -285,8 +285,7 @@ class _Evidence:
             parts.append(
                 self._log_evidence(levels[0], np.geomspace(*PART, _GRID)) + np.log(np.sum(prior[self._longest :]))
             )
-        posterior = np.exp(np.array(parts) - np.asarray(logsumexp(parts)))
-        return np.pad(posterior[: self._longest + 1], (0, LONGEST_PERIOD - self._longest))
+        return np.pad(softmax(parts)[: self._longest + 1], (0, LONGEST_PERIOD - self._longest))
 
     def _log_evidence(
         self, levels: list[_Level], q: Float[np.ndarray, " q"], weight: Float[np.ndarray, " q"] | float = 1.0 / _GRID

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from scipy import ndimage
 
 from capsule_id.records.tones import SIGNIFICANT, frequency_of, noise_level
 from capsule_id.rig.filters import PIECE, loudest_part
@@ -145,9 +146,8 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
     later = time[slow + _turning_points(values[slow:])] if len(time) - slow > WINDOW else time[:0]
     if len(later) > 6 and not smooth and later[-1] - later[0] > 1.5 * period * (len(later) - 1):
         width = int((later[-1] - later[0]) / (len(later) - 1) / 4.0 / np.median(np.diff(time)))
-        padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
-        values = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
-        decay = _find(time_bytes, values.tobytes(), displacement, smooth=True)
+        means = ndimage.uniform_filter1d(values, width, mode="nearest")
+        decay = _find(time_bytes, means.tobytes(), displacement, smooth=True)
     return decay
 
 
@@ -173,7 +173,7 @@ def _push(time: np.ndarray, values: np.ndarray, start: float, period: float) -> 
 
 def _turning_points(values: np.ndarray) -> np.ndarray:
     """Indices of the turning points that differ by more than noise, and of the ends of the first and the last leg."""
-    levels = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
+    levels = ndimage.median_filter(values, 3)[1:-1]
     limit = max(TURN * float(np.ptp(levels)), TURN_SDS * noise_level(values))
     turns, side, turn, other = list[int](), 0, 0, 0
     levels = levels.tolist()
@@ -196,10 +196,7 @@ def _scale(time: np.ndarray, values: np.ndarray, begin: int, end: int) -> tuple[
     """Period of the oscillation to a factor of two, from the steepest part of a leg, and a time behind its release."""
     passed = np.maximum.accumulate((values[begin : end + 1] - values[begin]) / (values[end] - values[begin]))
     levels = np.linspace(0.0, 1.0, 41)
-    place = np.clip(np.searchsorted(passed, levels), 1, len(passed) - 1)
-    low, high = passed[place - 1], passed[place]
-    part = np.where(high > low, (levels - low) / np.where(high > low, high - low, 1.0), 1.0)
-    times = time[begin + place - 1] + np.clip(part, 0.0, 1.0) * (time[begin + place] - time[begin + place - 1])
+    times = np.interp(levels, passed, time[begin : end + 1])
     steep = round(STEEP * 40)
     return float(np.min(times[steep:] - times[:-steep])) / STEEP_TIME, float(times[round(PAST * 40)])
 
@@ -207,10 +204,8 @@ def _scale(time: np.ndarray, values: np.ndarray, begin: int, end: int) -> tuple[
 def _growth(time: np.ndarray, values: np.ndarray, turns: np.ndarray) -> float | None:
     """Time before legs between ``turns`` that grow; None where none does. Two of them grow, and three were lower."""
     sizes = np.abs(np.diff(values[turns]))
-    highest = np.max(np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (2, 0), mode="edge"), 3), axis=1)
-    grown = sizes > GROWTH * np.minimum.accumulate(
-        np.concatenate([highest[:1], highest[:-1]])
-    ) + SMALLEST_PUSH * np.max(sizes)
+    highest = ndimage.maximum_filter1d(np.append(sizes[:1], sizes[:-1]), 3, mode="nearest", origin=1)
+    grown = sizes > GROWTH * np.minimum.accumulate(highest) + SMALLEST_PUSH * np.max(sizes)
     twice = 1 + np.flatnonzero(grown[1:-1] & grown[2:])
     return float(time[turns[twice[0]]]) if len(twice) else None
 

@@ -9,7 +9,7 @@ from jaxtyping import Num
 from scipy import stats
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
-from scipy.signal import correlate
+from scipy.signal import correlate, find_peaks
 
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import FEWEST_SAMPLES, PIECE, Record, dominant_frequency
@@ -392,7 +392,7 @@ def _offsets(time: np.ndarray, values: np.ndarray, other_time: np.ndarray, other
     one = np.interp(np.arange(time[0], time[-1], step), time, values - np.mean(values))
     other = np.interp(np.arange(other_time[0], other_time[-1], step), other_time, other_values - np.mean(other_values))
     products = np.abs(correlate(one, other, mode="full", method="fft"))
-    peaks = 1 + np.flatnonzero((products[1:-1] >= products[:-2]) & (products[1:-1] > products[2:]))
+    peaks, _ = find_peaks(products)
     peaks = peaks[products[peaks] >= LARGE * np.max(products[peaks], initial=0.0)]
     peaks = peaks[np.argsort(-products[peaks], kind="stable")][:_MOST_STARTS]
     found = time[0] - other_time[0] + (peaks - (len(other) - 1)) * step

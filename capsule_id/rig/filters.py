@@ -13,6 +13,7 @@ from bisect import bisect_left
 import numpy as np
 from jaxtyping import Float, Int, Num
 from numpy.polynomial import legendre
+from scipy import signal
 
 from capsule_id.errors import InputError
 from capsule_id.views import counted
@@ -221,10 +222,8 @@ def dominant_frequency(time: Record, values: Record) -> float:
 
 def _highest_peak(values: Record, step: float) -> float:
     """Frequency of the highest peak of the spectrum, Hz, of samples at distances of ``step``, s."""
-    index = np.arange(len(values)) / len(values)
-    residual = values - np.polyval(np.polyfit(index, values, 1), index)
     length = _ZERO_PADDING * len(values)
-    spectrum = np.abs(np.fft.rfft(residual, length))
+    spectrum = np.abs(np.fft.rfft(signal.detrend(values), length))
     # Below 1 / duration a peak is a remainder of the trend.
     return float(np.fft.rfftfreq(length, step)[_ZERO_PADDING + int(np.argmax(spectrum[_ZERO_PADDING:]))])
 
