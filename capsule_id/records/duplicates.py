@@ -226,12 +226,8 @@ def _equal_windows(earlier: np.ndarray, later: np.ndarray, length: int, same: bo
 
 def _hashes(values: np.ndarray, length: int) -> Iterable[tuple[int, np.ndarray]]:
     """Hashes of all windows of ``length`` rows, piece by piece, each with the row of its first window."""
-    factors = np.random.default_rng(0).integers(1, 1 << 62, (length, values.shape[1]), dtype=np.uint64)
+    factors = np.random.default_rng(0).integers(1, 1 << 62, (values.shape[1], length), dtype=np.uint64) | np.uint64(1)
     for begin in range(0, len(values) - length + 1, PIECE):
         rows = (values[begin : begin + PIECE + length - 1] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
         rows ^= rows >> np.uint64(29)
-        total = np.zeros(len(rows) - length + 1, np.uint64)
-        for offset, factor in enumerate(factors):
-            for column, each in enumerate(factor):
-                total += rows[offset : offset + len(total), column] * (each | np.uint64(1))
-        yield begin, total
+        yield begin, np.sum([np.correlate(*pair) for pair in zip(rows.T, factors, strict=True)], axis=0)

@@ -5,6 +5,8 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
+from scipy.spatial import KDTree
 from scipy.special import logsumexp, softmax
 from scipy.stats import norm
 
@@ -129,17 +131,15 @@ def _scatter_of_advances(time: Record, places: Record, T: float, variance: float
     variance : of the noise of ``places`` (n,), m^2
     """
     number = np.floor((time - time[0]) / T).astype(int)
-    counts = np.bincount(number)
-    whole = counts[:-1] > 0
-    means = (np.bincount(number, places)[:-1] / np.maximum(counts[:-1], 1))[whole]
-    advances = np.diff(means)
+    found, counts = np.unique(number, return_counts=True)
+    advances = np.diff(ndimage.mean(places, number, found[:-1]))
     if len(advances) < 2:
         return 0.0
     noise = 2.0 * variance / float(np.mean(counts[:-1]))
-    found = float(np.var(advances, ddof=1))
-    if found < noise * (1.0 + VISIBLE * np.sqrt(3.0 / len(advances))):
+    scatter = float(np.var(advances, ddof=1))
+    if scatter < noise * (1.0 + VISIBLE * np.sqrt(3.0 / len(advances))):
         return 0.0
-    return float(np.sqrt((found - noise) / len(advances)) / T)
+    return float(np.sqrt((scatter - noise) / len(advances)) / T)
 
 
 def _mean_of_advances(time: Record, values: Record, T: float) -> tuple[float, float]:
@@ -331,10 +331,8 @@ def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
     below = x_rel < cycle.gap - max(_CLEARANCE_SDS * cycle.gap_sd, _CLEARANCE_SHARE * float(np.ptp(x_rel)))
     if below.all():
         return below
-    other = np.sort(cycle.phase[~below])
-    other = np.concatenate([other - cycle.period, other, other + cycle.period])
-    after = np.searchsorted(other, cycle.phase).clip(1, len(other) - 1)
-    distance = np.minimum(cycle.phase - other[after - 1], other[after] - cycle.phase)
+    others = KDTree(np.unique(cycle.phase[~below])[:, None], boxsize=cycle.period)
+    distance = np.asarray(others.query(cycle.phase[:, None])[0])
     return below & (distance > _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega)
 
 
