@@ -360,7 +360,7 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
     lines += _setting_lines(found, guessed, kind)
-    lines += ["[experiment.columns]", *_column_lines(found, guessed)]
+    lines += ["[experiment.columns]", *_column_lines(found, guessed, kind)]
     return "\n".join(lines) + "\n"
 
 
@@ -466,15 +466,13 @@ def times_of_guess(found: FoundLayout, guessed: Guess) -> np.ndarray:
     return np.arange(len(next(iter(found.columns.values())))) / (guessed.rate or 1.0)
 
 
-def _column_lines(found: FoundLayout, guessed: Guess) -> Iterable[str]:
+def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
     """A line for each column of the map; as comments, one for each column of the file, where the user must choose."""
-    if TIME not in guessed.columns and guessed.rate is not None:
-        line = f'{TIME} = {{ rate = {{ value = {guessed.rate:g}, unit = "Hz" }} }}'
-        yield _commented(line, "likely", "the file states this rate and no times")
-    elif TIME not in guessed.columns and guessed.confidence == "unsure" and "sampling rate" in guessed.reason:
-        yield _commented(
-            f'{TIME} = {{ rate = {{ value = "{UNKNOWN}", unit = "Hz" }} }}', "unsure", "the file states no rate"
-        )
+    if TIME in kind.columns and TIME not in guessed.columns:
+        rate, confidence, reason = f'"{UNKNOWN}"', "unsure", "the file states no rate"
+        if guessed.rate is not None:
+            rate, confidence, reason = f"{guessed.rate:g}", "likely", "the file states this rate and no times"
+        yield _commented(f'{TIME} = {{ rate = {{ value = {rate}, unit = "Hz" }} }}', confidence, reason)
     for name, column in guessed.columns.items():
         for each in (column, *column.rivals):
             factor = "" if each.scale is None else f", scale = {each.scale:.10g}"

@@ -235,16 +235,9 @@ def _polynomials(time: Record, x: Record, T: float) -> tuple[Float[np.ndarray, "
     return CubicSpline(time, x)(places) @ np.linalg.pinv(legendre).T, (degree + 1) * step / T
 
 
-@dataclass(frozen=True)
-class _Level:
-    """Frequencies j/m of one m, for each of the correlations (r,): power of the filtered cycles there, filter gain.
-
-    dimensions : number of waves
-    """
-
-    power: Float[np.ndarray, " r"]
-    gain: Float[np.ndarray, " r"]
-    dimensions: int
+#: Frequencies j/m of one m: power of the filtered cycles there and filter gain for each of the correlations, (r,), and the
+#: number of waves.
+Level = tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"], int]
 
 
 class _Evidence:
@@ -288,7 +281,7 @@ class _Evidence:
         return np.pad(softmax(parts)[: self._longest + 1], (0, LONGEST_PERIOD - self._longest))
 
     def _log_evidence(
-        self, levels: list[_Level], q: Float[np.ndarray, " q"], weight: Float[np.ndarray, " q"] | float = 1.0 / _GRID
+        self, levels: list[Level], q: Float[np.ndarray, " q"], weight: Float[np.ndarray, " q"] | float = 1.0 / _GRID
     ) -> float:
         """Log-likelihood of a period with these levels, integrated over scatters q of prior ``weight`` and the rest.
 
@@ -296,19 +289,19 @@ class _Evidence:
         """
         r = CORRELATIONS[:, None]
         variance = (1.0 + r**2) * self._noise + (1.0 - r**2) * q**2
-        power = np.sum([level.power for level in levels], axis=0)[:, None]
-        dimensions = sum(level.dimensions for level in levels)
+        power = np.sum([own for own, *_ in levels], axis=0)[:, None]
+        dimensions = sum(number for *_, number in levels)
         value = -0.5 * self._independent * (dimensions * np.log(variance) + power / variance)
         part = np.geomspace(*PART, _GRID)[:, None, None]
-        for level in levels[1:]:
+        for own, gain, number in levels[1:]:
             # The likelihood of the level over that of scatter alone, for each variance of the scatter.
-            more = variance + level.gain[:, None] * len(self._cycles) * part**2 / level.dimensions
-            terms = level.dimensions * np.log(more / variance) + level.power[:, None] * (1.0 / more - 1.0 / variance)
+            more = variance + gain[:, None] * len(self._cycles) * part**2 / number
+            terms = number * np.log(more / variance) + own[:, None] * (1.0 / more - 1.0 / variance)
             ratio = logsumexp(-0.5 * self._independent * terms, axis=0) - np.log(_GRID)
-            value = value + (ratio if level is levels[-1] else np.logaddexp(0.0, ratio) - np.log(2.0))
+            value = value + (ratio if own is levels[-1][0] else np.logaddexp(0.0, ratio) - np.log(2.0))
         return float(logsumexp(value + np.log(weight)) - np.log(len(r)))
 
-    def _levels(self, n: int) -> list[_Level]:
+    def _levels(self, n: int) -> list[Level]:
         """What the drift and period n leave of the filtered cycles, then the levels of the divisors of n, n last."""
         last, before = self._cycles[1:], self._cycles[:-1]
         basis, divisors = self._basis(len(last), n)
@@ -317,12 +310,12 @@ class _Evidence:
         power = np.sum((one - r[:, :, None] * other) ** 2, axis=2)
         total = np.array([np.sum((last - x * before) ** 2) for x in CORRELATIONS.tolist()])
         levels, first = [], self._drift_terms
-        rest = _Level(total - np.sum(power, axis=1), np.ones_like(CORRELATIONS), len(last) - basis.shape[1])
+        rest = total - np.sum(power, axis=1), np.ones_like(CORRELATIONS), len(last) - basis.shape[1]
         for m, angles in divisors.items():
             number = sum(1 if 2 * j == m else 2 for j in angles)
             cosine = np.cos(2.0 * np.pi * np.array(angles) / m)
             gain = np.mean(1.0 - 2.0 * r * cosine + r**2, axis=1)
-            levels.append(_Level(np.sum(power[:, first : first + number], axis=1), gain, number))
+            levels.append((np.sum(power[:, first : first + number], axis=1), gain, number))
             first += number
         return [rest, *levels]
 

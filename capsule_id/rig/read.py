@@ -388,7 +388,7 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
         # Plateaus replace the time by the column of their levels.
         names = tuple(column_map.sources)
         if plateaus is not None:
-            names = (*(name for name in names if name != "time"), plateaus.name)
+            names = (*(name for name in names if name != "time"), plateaus[0])
         _check_names(names, kind, lambda name, *text: entry["columns"].error(*text))
         exports = {
             name: EXPORTS[suffix_of(file)](contents.pop(name), file, column_map.layout) for name, file in files.items()
