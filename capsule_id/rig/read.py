@@ -286,8 +286,8 @@ def remedy_of_order(raw: RawTable, index: int) -> str:
     rising = [
         other for other, c in zip(raw.names, raw.columns, strict=True) if other != name and np.all(np.diff(c) > 0.0)
     ]
-    firsts = np.unique(np.column_stack(raw.columns), axis=0, return_index=True)[1]
-    copies = np.setdiff1d(np.arange(len(time)), firsts)
+    equal = np.lexsort(raw.columns)  # equal rows one behind the other, the first one first
+    copies = np.sort(equal[1:][np.all([one[equal[1:]] == one[equal[:-1]] for one in raw.columns], axis=0)])
     order = np.argsort(time, kind="stable")
     rough = [sum(float(np.sum(np.abs(np.diff(c[rows])))) for c in raw.columns) for rows in (order, slice(None))]
     # A clock that stood still makes up for the lost time in one step.
