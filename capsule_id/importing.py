@@ -424,7 +424,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[s
         reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
         yield _commented('samples = "turning_points"', "unsure", reason)
         return
-    driven = "f" in kind.setting_rules and "f" not in constant
+    driven = "f" in kind.setting_rules and "f" not in constant and len(time) > 1
     if guessed.columns[TIME].unit == UNKNOWN if TIME in guessed.columns else guessed.rate is None:
         if driven:
             yield _commented(f'f = {{ value = "{UNKNOWN}", unit = "Hz" }}', "unsure", "state the set value")

@@ -28,7 +28,7 @@ WIDTH, TABLE_SCATTER = 2.0 * np.sqrt(np.pi), 0.01
 #: Rows that are compared at a time.
 COMPARED = 4096
 #: Most decimal places of a reading step; rounding error of a float64 relative to the largest one.
-MOST_DECIMALS, ROUNDING = np.finfo(float).precision, 2.0 * np.finfo(float).eps
+MOST_DECIMALS, EPSILON = np.finfo(float).precision, 2.0 * np.finfo(float).eps
 #: Distance of a level from an even spacing, in spacings; share of the levels that must be within it.
 LEVEL_TOLERANCE, REGULAR_LEVELS = 0.2, 0.9
 #: A gap between levels is large beyond so many steps; levels are uneven where this share of the gaps is large.
@@ -81,7 +81,7 @@ def reading_step(values: np.ndarray) -> float:
             return spacing
     first = -int(np.floor(np.log10(scale)))
     rounded = ((k, np.round(values, k), 1e-9 * 10.0**-k) for k in range(first, first + MOST_DECIMALS))
-    fits = (k for k, own, error in rounded if np.max(np.abs(own - values)) <= error + ROUNDING * scale)
+    fits = (k for k, own, error in rounded if np.max(np.abs(own - values)) <= error + EPSILON * scale)
     return next((10.0**-k for k in fits), 0.0)
 
 
@@ -95,7 +95,7 @@ def chance_of_equality(readings: Readings) -> float:
         if readings.record and len(values) >= FEWEST_SAMPLES:
             step, width = max(step, _uneven_spacing(values, step)), WIDTH * noise_level(values)
         # A step of 0 is that of float64.
-        own = min(1.0, max(step, ROUNDING * float(np.max(np.abs(values)))) / width) if width > 0.0 else 1.0
+        own = min(1.0, max(step, EPSILON * float(np.max(np.abs(values)))) / width) if width > 0.0 else 1.0
         # Rows that agree in one column but not in all show a setting that recurs, such as a load.
         chance *= own if readings.record else max(own, _equal_share(values) - _equal_share(readings.values))
     return chance

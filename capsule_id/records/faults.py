@@ -9,8 +9,7 @@ from numpy.polynomial import polynomial
 from scipy import ndimage, signal
 from scipy.optimize import least_squares
 
-from capsule_id.records.duplicates import ROUNDING as EPSILON
-from capsule_id.records.duplicates import reading_step
+from capsule_id.records.duplicates import EPSILON, reading_step
 from capsule_id.records.tones import AS_GOOD, BEYOND_CHANCE, ORDER, SIGNIFICANT, noise_level
 from capsule_id.rig.filters import FEWEST_SAMPLES, TIMING_TOLERANCE, largest_offset, median_step, thinned
 from capsule_id.rig.schema import SHORTEST_RECORD

@@ -50,8 +50,9 @@ def relative_position(table: Table) -> tuple[np.ndarray, float] | None:
 
 def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
     """Dominant frequency of a record that may be sampled unevenly, Hz."""
-    even = np.linspace(time[0], time[-1], len(time))
-    return dominant_frequency(even, np.interp(even, time, values))
+    # Times since 1970 have too few digits for an even grid.
+    even = np.linspace(0.0, time[-1] - time[0], len(time))
+    return dominant_frequency(even, np.interp(even, time - time[0], values))
 
 
 # noise: Estimates the noise level of a record from its differences, and finds where a decay is all noise.
