@@ -217,7 +217,7 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
         # Readings with so many significant digits have finer steps near zero than at a limit.
         large = few[few / limit >= LARGE_JUMP] if limit else few
         step = reading_step(large if len(large) >= FEWEST_LARGE else few)
-        tolerance = max(0.25 * step, EPSILON * max(abs(limit) for limit in limits))
+        tolerance = max(0.25 * step, EPSILON * np.max(np.abs(limits)))
         depth = sign * (limit - values)
         rows = np.flatnonzero(depth <= tolerance)
         near = np.flatnonzero((depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step))

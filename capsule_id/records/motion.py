@@ -323,7 +323,7 @@ def _shortfall(cycle: Cycle) -> Shortfall | None:
 
 def _linear_law_terms(cycle: Cycle, local: np.ndarray) -> np.ndarray:
     angle = cycle.Omega * cycle.time
-    return np.stack([np.ones_like(angle), local[0], local[1], np.cos(angle), np.sin(angle)], axis=1)
+    return np.stack([np.ones_like(angle), *local[:2], np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
