@@ -13,12 +13,11 @@ from capsule_id.experiments.kind import Kind, default_registry
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples
 from capsule_id.records.release import find_free_decay
-from capsule_id.records.tones import estimate_clock
-from capsule_id.rig.filters import clock_starts, dominant_frequency
+from capsule_id.records.tones import estimate_clock, frequency_of
+from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats.layouts import delimiter_of
 from capsule_id.rig.formats.raw import Layout, TextFile
 from capsule_id.rig.guess import (
-    FEWEST_SAMPLES,
     TIME,
     Assignment,
     ColumnGuess,
@@ -36,7 +35,7 @@ from capsule_id.rig.guess import (
     unit_of,
     used_layout,
 )
-from capsule_id.rig.schema import QuantityRule
+from capsule_id.rig.schema import SHORTEST_RECORD, QuantityRule
 from capsule_id.rig.units import UNKNOWN, factor_to_si
 from capsule_id.views import counted
 
@@ -181,7 +180,7 @@ def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess]
 def _is_record(found: FoundLayout, time: int | None) -> bool:
     """Whether a file is a record in time: long enough, with increasing times."""
     rows = len(next(iter(found.columns.values())))
-    return rows >= FEWEST_SAMPLES if time is None else rows >= 8 and increases(found.columns[time])
+    return rows >= FEWEST_SAMPLES if time is None else rows >= SHORTEST_RECORD and increases(found.columns[time])
 
 
 def _by_motion(found: FoundLayout, leading: list[Assignment]) -> tuple[Assignment, Confidence, str] | None:
@@ -255,10 +254,7 @@ def are_turning_points(values: np.ndarray) -> bool:
 
 def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None] | None:
     """Start and stop of the free decay in a record, s; None where all of it is free or nothing swings."""
-    try:
-        decay = find_free_decay(time, values)
-    except InputError:
-        return None
+    decay = find_free_decay(time, values)
     if decay is None or np.any(np.diff(time) <= 0.0) or (decay.rest == 0.0 and decay.stop is None):
         return None
     return decay.start, decay.end
@@ -292,7 +288,7 @@ def propose_entry(file: str | Path) -> str:
         If the file cannot be read.
     """
     path = Path(file)
-    return entry_of(read_file(path), path, path.name, default_registry())[0]
+    return entry_of(read_file(path), path, default_registry())[0]
 
 
 def read_file(path: Path) -> bytes:
@@ -316,13 +312,12 @@ def read_file(path: Path) -> bytes:
         raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None
 
 
-def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
+def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
     """The lines of ``[[experiment]]`` for one export, and the guess; without a guess the lines are comments.
 
     Parameters
     ----------
-    content, path : the bytes of the file, and its name for error lines
-    file : its name in ``rig.toml``
+    content, path : the bytes of the file, and its path; ``rig.toml`` names it without the folder
     kinds : the kinds of experiments
 
     Raises
@@ -332,12 +327,12 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
     """
     found = find_layout(content, path, dimensions_of(kinds))
     guessed = guess(found, kinds)
-    return _entry(found, guessed, content, file, kinds), guessed
+    return _entry(found, guessed, content, kinds), guessed
 
 
-def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, file: str, kinds: Mapping[str, Kind]) -> str:
+def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Mapping[str, Kind]) -> str:
     """The lines of ``[[experiment]]`` for an export with its guess."""
-    unread = list(_unread_lines(found, dimensions_of(kinds)))
+    unread, file = list(_unread_lines(found, dimensions_of(kinds))), found.export.path.name
     if guessed is None:
         words = " ".join(kinds)
         headers = ", ".join(name for name in found.names if name) or "none"
@@ -364,8 +359,8 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, file: str,
     lines = [*unread, "[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
-    lines += _setting_lines(found, guessed, kind, file)
-    lines += ["[experiment.columns]", *_column_lines(found, guessed)]
+    lines += _setting_lines(found, guessed, kind)
+    lines += ["[experiment.columns]", *_column_lines(found, guessed, kind)]
     return "\n".join(lines) + "\n"
 
 
@@ -410,10 +405,12 @@ def _layout_lines(found: FoundLayout, used: Layout) -> Iterable[str]:
             yield _commented(f"{key} = {json.dumps(value, ensure_ascii=False)}", confidence, reason)
 
 
-def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) -> Iterable[str]:
+def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
     """Settings that the record or the name of the file suggests."""
     for key in kind.required:
-        stem = "".join(mark if mark.isalnum() or mark in "._-" else "_" for mark in Path(file).name.split(".")[0])
+        stem = "".join(
+            mark if mark.isalnum() or mark in "._-" else "_" for mark in found.export.path.name.split(".")[0]
+        )
         yield _commented(f'{key} = "{stem}"', "unsure", "from the name of the file")
     constant = _constant_settings(found, guessed, kind)
     yield from constant.values()
@@ -427,7 +424,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
         reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
         yield _commented('samples = "turning_points"', "unsure", reason)
         return
-    driven = "f" in kind.setting_rules and "f" not in constant
+    driven = "f" in kind.setting_rules and "f" not in constant and len(time) > 1
     if guessed.columns[TIME].unit == UNKNOWN if TIME in guessed.columns else guessed.rate is None:
         if driven:
             yield _commented(f'f = {{ value = "{UNKNOWN}", unit = "Hz" }}', "unsure", "state the set value")
@@ -438,12 +435,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
         if stop is not None:
             yield _commented(f'stop = {{ value = {stop:.6g}, unit = "s" }}', "likely", "another excitation begins here")
     if driven:
-        even = np.linspace(time[0], time[-1], len(time))
-        try:
-            frequency = dominant_frequency(even, np.interp(even, time, values))
-        except InputError:
-            return
-        line = f'f = {{ value = {frequency:.4g}, unit = "Hz" }}'
+        line = f'f = {{ value = {frequency_of(time, values):.4g}, unit = "Hz" }}'
         yield _commented(line, "unsure", f"the strongest frequency of {channel}; state the set value")
 
 
@@ -474,15 +466,13 @@ def times_of_guess(found: FoundLayout, guessed: Guess) -> np.ndarray:
     return np.arange(len(next(iter(found.columns.values())))) / (guessed.rate or 1.0)
 
 
-def _column_lines(found: FoundLayout, guessed: Guess) -> Iterable[str]:
+def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
     """A line for each column of the map; as comments, one for each column of the file, where the user must choose."""
-    if TIME not in guessed.columns and guessed.rate is not None:
-        line = f'{TIME} = {{ rate = {{ value = {guessed.rate:g}, unit = "Hz" }} }}'
-        yield _commented(line, "likely", "the file states this rate and no times")
-    elif TIME not in guessed.columns and guessed.confidence == "unsure" and "sampling rate" in guessed.reason:
-        yield _commented(
-            f'{TIME} = {{ rate = {{ value = "{UNKNOWN}", unit = "Hz" }} }}', "unsure", "the file states no rate"
-        )
+    if TIME in kind.columns and TIME not in guessed.columns:
+        rate, confidence, reason = f'"{UNKNOWN}"', "unsure", "the file states no rate"
+        if guessed.rate is not None:
+            rate, confidence, reason = f"{guessed.rate:g}", "likely", "the file states this rate and no times"
+        yield _commented(f'{TIME} = {{ rate = {{ value = {rate}, unit = "Hz" }} }}', confidence, reason)
     for name, column in guessed.columns.items():
         for each in (column, *column.rivals):
             factor = "" if each.scale is None else f", scale = {each.scale:.10g}"
@@ -527,7 +517,7 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
     for row in [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]:
         cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
         lines.append(f"line {found.export.lines[row]}: {'  '.join(cells)}")
-    return [*lines, "", _entry(found, guessed, content, path.name, kinds).rstrip()]
+    return [*lines, "", _entry(found, guessed, content, kinds).rstrip()]
 
 
 def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:
@@ -578,7 +568,7 @@ def _sampling(time: np.ndarray) -> Iterable[str]:
         yield f"sampling: the times do not increase at {counted(int(np.sum(steps <= 0.0)), 'row')}"
         return
     step = float(np.median(steps))
-    jitter = float(np.sqrt(np.mean((steps[steps < 1.5 * step] / step - 1.0) ** 2)))
+    jitter = float(np.sqrt(np.mean((steps[np.round(steps / step) < 2.0] / step - 1.0) ** 2)))
     yield f"sampling: {1.0 / step:.6g} Hz from {time[0]:.6g} to {time[-1]:.6g} s, jitter {jitter:.2%} of a step (rms)"
     gaps = find_gaps(time)
     if gaps is not None:

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     contents = {path.name: read_file(path) for path in files}
     if len(contents) < len(files):
         raise InputError("files must have different names", "two of one name", "rename one of them", folder)
-    guesses = {path.name: entry_of(contents[path.name], path, path.name, kinds) for path in files}
+    guesses = {path.name: entry_of(contents[path.name], path, kinds) for path in files}
     with refusing("DIR must be writable", "name another one", folder):
         own = {path.resolve() for path in files}
         if folder.exists() and (not folder.is_dir() or any(each.resolve() not in own for each in folder.iterdir())):

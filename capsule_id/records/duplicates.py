@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from capsule_id.records.tones import noise_level
-from capsule_id.rig.filters import PIECE, thinned
+from capsule_id.rig.filters import FEWEST_SAMPLES, PIECE, thinned
+from capsule_id.rig.model import SAME
 
 # duplicates: Finds readings that occur twice: equal tables, and equal blocks of rows within or across tables.
 #
@@ -19,14 +20,15 @@ from capsule_id.rig.filters import PIECE, thinned
 CHANCE = 1e-6
 #: Chance of equal rows above which only equal tables count as repeated.
 COARSE = 0.5
-#: Shortest block of a record, samples; shortest record whose noise level is estimated.
-SHORTEST_BLOCK, SHORTEST_RECORD = 8, 50
-#: Width of a scatter, in standard deviations; scatter of a table of single readings, relative to its range.
-WIDTH, TABLE_SCATTER = 3.5, 0.01
+#: Shortest block of a record, samples.
+SHORTEST_BLOCK = 8
+#: Width of a normal scatter, in standard deviations: two values lie within a small step of each other with the probability
+#: step / width. Scatter of a table of single readings, relative to its range.
+WIDTH, TABLE_SCATTER = 2.0 * np.sqrt(np.pi), 0.01
 #: Rows that are compared at a time.
 COMPARED = 4096
-#: Most decimal places of a reading step.
-MOST_DECIMALS = 15
+#: Most decimal places of a reading step; rounding error of a float64 relative to the largest one.
+MOST_DECIMALS, EPSILON = np.finfo(float).precision, 2.0 * np.finfo(float).eps
 #: Distance of a level from an even spacing, in spacings; share of the levels that must be within it.
 LEVEL_TOLERANCE, REGULAR_LEVELS = 0.2, 0.9
 #: A gap between levels is large beyond so many steps; levels are uneven where this share of the gaps is large.
@@ -71,15 +73,15 @@ def reading_step(values: np.ndarray) -> float:
     values = thinned(values)
     levels = np.unique(values)
     gaps = np.diff(levels)
-    gaps = gaps[gaps > 1e-9 * scale]
-    most = MOST_LEVELS if len(values) < SHORTEST_RECORD else MOST_LEVELS_OF_RECORD
+    gaps = gaps[gaps > SAME * scale]
+    most = MOST_LEVELS if len(values) < FEWEST_SAMPLES else MOST_LEVELS_OF_RECORD
     if 2 < len(gaps) < most * len(values):
-        spacing = float(np.median(gaps[gaps < 1.5 * np.min(gaps)]))
+        spacing = float(np.median(gaps[np.round(gaps / np.min(gaps)) < 2.0]))
         if np.mean(np.abs(gaps / spacing - np.round(gaps / spacing)) < LEVEL_TOLERANCE) > REGULAR_LEVELS:
             return spacing
     first = -int(np.floor(np.log10(scale)))
     rounded = ((k, np.round(values, k), 1e-9 * 10.0**-k) for k in range(first, first + MOST_DECIMALS))
-    fits = (k for k, own, error in rounded if np.max(np.abs(own - values)) <= error + 4e-16 * scale)
+    fits = (k for k, own, error in rounded if np.max(np.abs(own - values)) <= error + EPSILON * scale)
     return next((10.0**-k for k in fits), 0.0)
 
 
@@ -90,10 +92,10 @@ def chance_of_equality(readings: Readings) -> float:
     for values, factor in zip(readings.values.T, factors, strict=True):
         # A step of 0.1 deg is a decimal one in deg alone.
         step, width = reading_step(factor * thinned(values)) / factor, TABLE_SCATTER * float(np.ptp(values))
-        if readings.record and len(values) >= SHORTEST_RECORD:
+        if readings.record and len(values) >= FEWEST_SAMPLES:
             step, width = max(step, _uneven_spacing(values, step)), WIDTH * noise_level(values)
         # A step of 0 is that of float64.
-        own = min(1.0, max(step, 4e-16 * float(np.max(np.abs(values)))) / width) if width > 0.0 else 1.0
+        own = min(1.0, max(step, EPSILON * float(np.max(np.abs(values)))) / width) if width > 0.0 else 1.0
         # Rows that agree in one column but not in all show a setting that recurs, such as a load.
         chance *= own if readings.record else max(own, _equal_share(values) - _equal_share(readings.values))
     return chance
@@ -135,7 +137,7 @@ def _candidates(tables: Sequence[Readings], chances: Sequence[float]) -> Iterabl
     """Indices of the earlier and the later table of each pair that may share a block, each table with itself included.
 
     They share a window of the shortest length that counts for any pair, or all rows where ``chances`` leave no shorter
-    block. Long tables, of which some windows alone are compared, are paired with all others.
+    block.
     """
     number, fewest = len(tables), max(min((len(each.values) for each in tables), default=1), 1)
     fine = [k for k in range(number) if chances[k] < COARSE]
@@ -151,8 +153,6 @@ def _candidates(tables: Sequence[Readings], chances: Sequence[float]) -> Iterabl
         moving = moves[length - 1 :] - moves[: len(hashes)] >= length // 4
         windows.append(np.unique(hashes[moving] if each.record else hashes))
     codes = {k * number + k for k in range(number)}
-    for k in (k for k, each in enumerate(tables) if len(each.values) >= 2 * PIECE):
-        codes.update(max(k, other) * number + min(k, other) for other in range(number))
     hashes, owners = np.concatenate(windows), np.repeat(np.arange(number), [len(found) for found in windows])
     order = np.argsort(hashes, kind="stable")
     hashes, owners, shift = hashes[order], owners[order], 1
@@ -190,9 +190,6 @@ def _longest_block(earlier: Readings, later: Readings, chance: float) -> Repeate
         window = later.values[start : start + shortest]
         if later.record and np.sum(np.any(window[1:] != window[:-1], axis=1)) < shortest // 2:
             continue
-        if len(earlier.values) >= 2 * PIECE:  # the block may begin before a window that was compared
-            back = _equal_rows(earlier.values[:where][::-1], later.values[:start][::-1])
-            where, start = where - back, start - back
         count = _equal_rows(earlier.values[where:], later.values[start:])
         ends[start - where] = start + count
         # Trials of one load that are read in coarse steps agree, even where the whole table looks fine: the rows of the
@@ -216,30 +213,21 @@ def _equal_rows(one: np.ndarray, other: np.ndarray) -> int:
 
 
 def _equal_windows(earlier: np.ndarray, later: np.ndarray, length: int, same: bool) -> Iterable[tuple[int, int]]:
-    """First rows of windows of ``length`` rows with equal hashes: in ``earlier``, the first such one, and in ``later``.
-
-    Of a long table only every ``length``-th window of ``earlier`` is compared, which finds blocks twice as long.
-    """
-    stride = 1 if len(earlier) < 2 * PIECE else length
-    # The first window of a piece whose row is a multiple of the stride is -begin % stride rows after its first one.
-    hashes = np.concatenate([found[-begin % stride :: stride] for begin, found in _hashes(earlier, length)])
+    """First rows of windows of ``length`` rows with equal hashes: in ``earlier``, the first such one, and in ``later``."""
+    hashes = np.concatenate([found for _, found in _hashes(earlier, length)])
     index = np.argsort(hashes, kind="stable")
     known = hashes[index]
     for begin, found in _hashes(later, length):
         place = np.minimum(np.searchsorted(known, found), len(known) - 1)
-        where, start = stride * index[place], begin + np.arange(len(found))
+        where, start = index[place], begin + np.arange(len(found))
         equal = (known[place] == found) & ((where < start) if same else True)
         yield from zip(where[equal].tolist(), start[equal].tolist(), strict=True)
 
 
 def _hashes(values: np.ndarray, length: int) -> Iterable[tuple[int, np.ndarray]]:
     """Hashes of all windows of ``length`` rows, piece by piece, each with the row of its first window."""
-    factors = np.random.default_rng(0).integers(1, 1 << 62, (length, values.shape[1]), dtype=np.uint64)
+    factors = np.random.default_rng(0).integers(1, 1 << 62, (values.shape[1], length), dtype=np.uint64) | np.uint64(1)
     for begin in range(0, len(values) - length + 1, PIECE):
         rows = (values[begin : begin + PIECE + length - 1] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
         rows ^= rows >> np.uint64(29)
-        total = np.zeros(len(rows) - length + 1, np.uint64)
-        for offset, factor in enumerate(factors):
-            for column, each in enumerate(factor):
-                total += rows[offset : offset + len(total), column] * (each | np.uint64(1))
-        yield begin, total
+        yield begin, np.sum([np.correlate(*pair) for pair in zip(rows.T, factors, strict=True)], axis=0)

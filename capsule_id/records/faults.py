@@ -9,9 +9,10 @@ from numpy.polynomial import polynomial
 from scipy import ndimage, signal
 from scipy.optimize import least_squares
 
-from capsule_id.records.duplicates import reading_step
-from capsule_id.records.tones import noise_level
-from capsule_id.rig.filters import largest_offset, median_step, thinned
+from capsule_id.records.duplicates import EPSILON, reading_step
+from capsule_id.records.tones import AS_GOOD, BEYOND_CHANCE, ORDER, SIGNIFICANT, noise_level
+from capsule_id.rig.filters import FEWEST_SAMPLES, TIMING_TOLERANCE, largest_offset, median_step, thinned
+from capsule_id.rig.schema import SHORTEST_RECORD
 
 # aliasing: Finds frequencies that a sampled oscillation cannot tell from each other.
 #
@@ -20,8 +21,6 @@ from capsule_id.rig.filters import largest_offset, median_step, thinned
 
 #: Fewest and most multiples of the sampling rate that are tried; damping rates that are tried, per sampled period.
 MULTIPLES, MOST_MULTIPLES, RATES = 5, 200, np.geomspace(1e-3, 1.0, 13)
-#: Another frequency fits as well where its sum of squares is below this multiple.
-AS_WELL = 1.5
 #: Steps of the time that differ less than this from the median, relative, are usual ones.
 USUAL_STEP = 0.2
 #: Most decimal places, and most significant digits, of rounded times. Samples that are looked at: they show as much as a
@@ -44,9 +43,9 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: flo
     time, values = time[:SAMPLES], values[:SAMPLES]
     (rate, even), elapsed = sampling(time), time - time[0]
     number = np.clip(int((highest + frequency) / rate) + 2, MULTIPLES, MOST_MULTIPLES)
-    multiples = np.arange(1, number + 1) * rate
+    multiples = np.delete(np.arange(-number, number + 1), number) * rate
     if even:
-        return np.unique(np.abs(np.concatenate([multiples - frequency, multiples + frequency])))
+        return np.unique(np.abs(multiples + frequency))
 
     def rest(f: float, damping: float) -> np.ndarray:
         """(n,) residuals beside a tone of this frequency, Hz, with this damping rate, 1/s."""
@@ -66,12 +65,12 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: flo
     # The best of the steps leaves a misfit that hides what another frequency does not explain.
     step, size = PHASE / elapsed[-1], float(np.std(values)) or 1.0
     least, frequency, damping = best(frequency, min(RATES * frequency, key=lambda rate: misfit(frequency, rate)))
-    candidates = np.unique(np.abs(np.concatenate([multiples - frequency, multiples + frequency])))
+    candidates = np.unique(np.abs(multiples + frequency))
     # The jitter of the times leaves an error of the sampling rate.
     others = np.array([min(misfit(other + k * step, damping) for k in NEAR) for other in candidates])
     candidates, others = candidates[order := np.argsort(others)], others[order]
     others[:REFINED] = [best(other, damping)[0] for other in candidates[:REFINED]]
-    return candidates[others <= AS_WELL * least + 1e-12 * float(np.sum(values**2))]
+    return candidates[others <= AS_GOOD * least + 1e-12 * float(np.sum(values**2))]
 
 
 def sampling(time: np.ndarray) -> tuple[float, bool]:
@@ -108,8 +107,6 @@ WINDOWS, SHORTEST = 8, 8
 LOUD, FEWEST_WINDOWS = 3.0, 3
 #: Quiet windows within a burst.
 GAP = 1
-#: Order of the differences that remove the oscillation.
-ORDER = 3
 
 
 def noisy_stretch(values: np.ndarray, period: float, row: int) -> slice | None:
@@ -127,7 +124,7 @@ def noisy_stretch(values: np.ndarray, period: float, row: int) -> slice | None:
     differences = np.diff(values, ORDER, prepend=values[:1], append=values[-1:].repeat(ORDER - 1))
     squares = (differences[: number * width] ** 2).reshape(number, width)
     noise = np.sqrt(np.mean(squares, axis=1) / math.comb(2 * ORDER, ORDER))
-    loud = np.flatnonzero(noise > LOUD * max(float(np.median(noise)), 1e-300))
+    loud = np.flatnonzero(noise > LOUD * np.median(noise))
     for chain in np.split(loud, np.flatnonzero(np.diff(loud) > GAP + 1) + 1):
         if len(chain) >= FEWEST_WINDOWS and chain[0] - GAP <= row // width <= chain[-1] + GAP:
             return slice(int(chain[0]) * width, min((int(chain[-1]) + 1) * width, len(values)))
@@ -140,7 +137,7 @@ def noisy_stretch(values: np.ndarray, period: float, row: int) -> slice | None:
 #: Shortest record for these checks, in periods of the drive.
 FEWEST_PERIODS = 3.0
 #: Standard errors beyond which a sign counts as wrong.
-SIGN_ERRORS = 6.0
+SIGN_ERRORS = BEYOND_CHANCE
 #: Admissible ratio of a recorded derivative to that of a recorded position.
 OF_DERIVATIVE = 0.5, 2.0
 
@@ -166,7 +163,7 @@ def phasor(time: np.ndarray, values: np.ndarray, Omega: float) -> Phasor:
     t, x = time[last], values[last]
     design = np.stack([np.cos(Omega * t), np.sin(Omega * t), np.ones_like(t), t - t[0]], axis=1)
     cosine, sine, *_ = np.linalg.lstsq(design, x)[0]
-    noise = noise_level(x, 6) if len(x) > 50 else float(np.std(x))
+    noise = noise_level(x, 6) if len(x) >= FEWEST_SAMPLES else float(np.std(x))
     return Phasor(complex(cosine, -sine), noise * float(np.sqrt(2.0 / len(x))))
 
 
@@ -222,7 +219,7 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
         # Readings with so many significant digits have finer steps near zero than at a limit.
         large = few[few / limit >= LARGE_JUMP] if limit else few
         step = reading_step(large if len(large) >= FEWEST_LARGE else few)
-        tolerance = max(0.25 * step, 4e-16 * max(abs(limit) for limit in limits))
+        tolerance = max(0.25 * step, EPSILON * np.max(np.abs(limits)))
         depth = sign * (limit - values)
         rows = np.flatnonzero(depth <= tolerance)
         near = np.flatnonzero((depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step))
@@ -259,12 +256,10 @@ def _one_sided(near: np.ndarray, rows: np.ndarray) -> int:
 #: beyond their own error. Long ones see through noise, short ones show small jumps of quiet records. A jump above LARGE
 #: may be one of the slope alone.
 PHASE_ORDER, SIDES, LARGE = 3, ((0.25, 0.3), (0.125, 0.06)), 0.2
-#: Smallest jump: standard deviations of the noise, and sampling steps.
-JUMP_SDS, JUMP_STEPS = 6.0, 0.7
+#: Smallest jump, in sampling steps.
+JUMP_STEPS = 0.7
 #: Median of the deviation under white noise: that of a Rayleigh variable.
 MEDIAN = np.sqrt(2.0 * np.log(2.0))
-#: The oscillation must be at least this many times the noise.
-AMPLITUDE_NOISE = 4.0
 #: A jump recurs where half a period away, give or take this part of a period, one of opposite sign has this part of it.
 SLACK, RECURRING = 0.1, 0.5
 #: Periods after a jump for which the oscillation must go on, else dry friction may have ended it before a jump recurs.
@@ -330,15 +325,15 @@ def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: 
     # Kinks of real records, as of a sensor's scale, are small; a small jump must show in the value.
     size = np.hypot(jumps[0], jumps[1] / step) if smallest > LARGE else np.abs(jumps[0])
     phase = size / np.maximum(amplitude, 1e-300)
-    large = (deviation > JUMP_SDS) & (phase > max(smallest, JUMP_STEPS * step)) & (amplitude > AMPLITUDE_NOISE * noise)
+    swings = amplitude > SIGNIFICANT * noise
+    large = (deviation > BEYOND_CHANCE) & (phase > max(smallest, JUMP_STEPS * step)) & swings
     if alone:
-        later = np.minimum(np.arange(len(deviation)) + round(GOES_ON * period), len(deviation) - 1)
-        large &= amplitude[later] > AMPLITUDE_NOISE * noise
+        large &= swings[np.minimum(np.arange(len(deviation)) + round(GOES_ON * period), len(deviation) - 1)]
     noisy = None
     while large.any():
         worst = int(np.argmax(np.where(large, deviation, 0.0)))
         # The record may be noisier here than elsewhere.
-        hidden = deviation[worst] * noise <= JUMP_SDS * _local_noise(values[worst : worst + 2 * side])
+        hidden = deviation[worst] * noise <= BEYOND_CHANCE * _local_noise(values[worst : worst + 2 * side])
         found = Jump(worst + side, float(phase[worst]), bool(hidden))
         if not hidden and not (alone and _recurs(jumps, precision, worst, period)):
             return found
@@ -383,8 +378,9 @@ def _recurs(jumps: np.ndarray, precision: np.ndarray, place: int, period: float)
 REGULAR_SHARE = 0.9
 #: Largest distance of a step from a multiple of the sampling step, in sampling steps.
 STEP_TOLERANCE = 0.1
-#: Smallest and largest rounding of times, in sampling steps: below it is harmless.
-ROUNDING = (0.02, 1.01)
+#: Smallest and largest rounding of times, in sampling steps. Rounding moves a time by half of it: times that it moves less
+#: than this from the even grid count as even.
+ROUNDING = (2.0 * TIMING_TOLERANCE, 1.01)
 #: A drop-out departs from both neighbours by this fraction of the range of the other samples.
 DROPOUT_RANGE = 0.5
 #: In coarse steps a smooth top is a short run too. A drop-out departs by more than this many reading steps, and than this
@@ -397,8 +393,8 @@ DROPOUT_NOISE, LARGEST_SHARE = 20.0, 0.5
 EXTREME = 50.0
 #: Most samples of one drop-out; fewest equal values of a frozen sensor.
 LONGEST_DROPOUT, FROZEN = 3, 6
-#: Samples from which a record shows its noise level, and a frozen sensor.
-FEWEST_OF_NOISE, FEWEST_OF_FROZEN = 20, 50
+#: Samples from which a drop-out is compared with the noise level.
+FEWEST_OF_NOISE = 20
 
 
 @dataclass(frozen=True)
@@ -415,10 +411,8 @@ def find_gaps(time: np.ndarray) -> Gaps | None:
 
     Parameters
     ----------
-    time : (n,) s, increasing
+    time : (n,) s, increasing, n > 1
     """
-    if len(time) < 9:
-        return None
     step = median_step(time)
     steps = np.diff(time) / step
     multiple = np.round(steps)
@@ -434,13 +428,19 @@ def time_rounding(time: np.ndarray) -> float | None:
     ----------
     time : (n,) s, increasing
     """
-    if len(time) < 8:
+    if len(time) < SHORTEST_RECORD:
         return None
     step, written = median_step(time), reading_step(time)
     off = largest_offset(time, (time[-1] - time[0]) / (len(time) - 1))
     rounded = ROUNDING[0] * step <= written <= ROUNDING[1] * step
     # Rounding moves a time by half the written step, and the ends of the even grid by as much again.
-    return written if rounded and ROUNDING[0] * step / 2.0 < off <= 1.01 * written else None
+    return written if rounded and TIMING_TOLERANCE * step < off <= ROUNDING[1] * written else None
+
+
+def _equal_runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First indices of the runs of equal values, and the indices behind their last ones, (k,) each."""
+    edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
+    return edges[:-1], edges[1:]
 
 
 def dropouts(values: np.ndarray) -> np.ndarray:
@@ -454,10 +454,9 @@ def dropouts(values: np.ndarray) -> np.ndarray:
     low, high = np.quantile(thinned(values), [0.05, 0.95])
     noise = DROPOUT_NOISE * noise_level(values) if len(values) > FEWEST_OF_NOISE else 0.0
     spread = max(high - low, min(noise, LARGEST_SHARE * float(np.ptp(values))))
-    starts = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1])
-    lengths = np.diff(np.concatenate([starts, [len(values)]]))
-    inside = (starts > 0) & (starts + lengths < len(values)) & (lengths <= LONGEST_DROPOUT)
-    starts, ends = starts[inside], (starts + lengths)[inside]
+    starts, ends = _equal_runs(values)
+    inside = (starts > 0) & (ends < len(values)) & (ends - starts <= LONGEST_DROPOUT)
+    starts, ends = starts[inside], ends[inside]
     before, after, own = values[starts - 1], values[ends], values[starts]
     jump = np.minimum(np.abs(own - before), np.abs(own - after))
     earlier = np.abs(values[np.maximum(starts - 2, 0)] - before)
@@ -478,13 +477,11 @@ def frozen_samples(values: np.ndarray) -> np.ndarray:
 
     Runs at the limits of the record belong to clipping and to rest, and are left out.
     """
-    repeats = np.concatenate([[False], values[1:] == values[:-1], [False]])
-    edges = np.flatnonzero(repeats[1:] != repeats[:-1]) + 1
-    starts, ends = edges[::2], edges[1::2]
-    inside = (values[starts] < np.max(values)) & (values[starts] > np.min(values)) & (starts > 1) & (ends < len(values))
-    chosen = (ends - starts + 1 >= FROZEN) & inside
+    starts, ends = _equal_runs(values)
+    inside = (values[starts] < np.max(values)) & (values[starts] > np.min(values)) & (starts > 0) & (ends < len(values))
+    chosen = (ends - starts >= FROZEN) & inside
     # A channel read in coarse steps, or at rest, repeats its values anyway.
-    others = np.sum(repeats) - np.sum((ends - starts)[chosen])
-    if len(values) < FEWEST_OF_FROZEN or others > 0.01 * len(values):
+    others = np.sum((ends - starts - 1)[~chosen])
+    if len(values) < FEWEST_SAMPLES or others > 0.01 * len(values):
         return np.arange(0)
-    return np.concatenate([np.arange(0), *map(np.arange, starts[chosen] - 1, ends[chosen])])
+    return np.concatenate([np.arange(0), *map(np.arange, starts[chosen], ends[chosen])])

@@ -5,12 +5,15 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy import ndimage
+from scipy.spatial import KDTree
+from scipy.special import logsumexp, softmax
 from scipy.stats import norm
 
 from capsule_id.errors import InputError
 from capsule_id.records.periods import (
     DECIDED,
+    VISIBLE,
     Repeat,
     find_period,
     first_true,
@@ -19,6 +22,7 @@ from capsule_id.records.periods import (
     period_word,
 )
 from capsule_id.records.tones import (
+    BEYOND_CHANCE,
     Harmonic,
     fit_harmonic,
     recorded_drive,
@@ -40,8 +44,6 @@ CONFIDENCE = 0.99
 _MOST_HARMONICS = 24  # of the motion's frequency in the periodic part of X2
 _SAMPLES_PER_VELOCITY = 4  # at least
 _ADVANCES = 2000  # values of the advance, for the integrals of the probabilities
-_ROUNDING = 1e-3  # smallest standard error of an advance, of the largest one of a standing capsule
-_SIGNIFICANT = 3.0  # standard deviations of the noise's own variance; larger scatter of the advances counts
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,6 @@ def _probabilities(advance: float, sd: float, largest: float) -> dict[str, float
     """Posterior probability of each direction, given the advance per period and its standard error, m."""
     if not np.isfinite(sd):
         return dict.fromkeys("FBS", 1.0 / 3.0)
-    sd = max(sd, _ROUNDING * STANDING_ADVANCE)
     moving = np.geomspace(STANDING_ADVANCE, max(largest, 2.0 * STANDING_ADVANCE, 2.0 * abs(advance)), _ADVANCES)
     standing = np.linspace(-STANDING_ADVANCE, STANDING_ADVANCE, _ADVANCES)
     logs = {
@@ -104,8 +105,7 @@ def _probabilities(advance: float, sd: float, largest: float) -> dict[str, float
             ("S", standing, np.gradient(standing)),
         )
     }
-    total = float(np.asarray(logsumexp(list(logs.values()))))
-    return {word: float(np.exp(value - total)) for word, value in logs.items()}
+    return dict(zip(logs, softmax(list(logs.values())).tolist(), strict=True))
 
 
 def _slope_with_harmonics(time: Record, values: Record, T: float) -> tuple[float, float]:
@@ -131,17 +131,15 @@ def _scatter_of_advances(time: Record, places: Record, T: float, variance: float
     variance : of the noise of ``places`` (n,), m^2
     """
     number = np.floor((time - time[0]) / T).astype(int)
-    counts = np.bincount(number)
-    whole = counts[:-1] > 0
-    means = (np.bincount(number, places)[:-1] / np.maximum(counts[:-1], 1))[whole]
-    if len(means) < 3:
+    found, counts = np.unique(number, return_counts=True)
+    advances = np.diff(ndimage.mean(places, number, found[:-1]))
+    if len(advances) < 2:
         return 0.0
-    advances = np.diff(means)
     noise = 2.0 * variance / float(np.mean(counts[:-1]))
-    found = float(np.var(advances, ddof=1))
-    if found < noise * (1.0 + _SIGNIFICANT * np.sqrt(3.0 / len(advances))):
+    scatter = float(np.var(advances, ddof=1))
+    if scatter < noise * (1.0 + VISIBLE * np.sqrt(3.0 / len(advances))):
         return 0.0
-    return float(np.sqrt((found - noise) / len(advances)) / T)
+    return float(np.sqrt((scatter - noise) / len(advances)) / T)
 
 
 def _mean_of_advances(time: Record, values: Record, T: float) -> tuple[float, float]:
@@ -175,12 +173,10 @@ _NARROW_SAMPLES = 9  # samples of the folded record in the narrow window, at lea
 _WIDE_HALF_WIDTH = 0.02  # of the excitation period, half-width for the linear law: rates with little noise
 _CLEARANCE_SHARE = 0.05  # of the range of x_rel: samples this far below the gap are clear of contact,
 _CLEARANCE_SDS = 5.0  # and this many sd of the stated gap below it
-_CONTACT_STANDARD_ERRORS = 6.0  # standard errors; larger spikes determine the impact line
 _IMPACT_LINE_SHIFTS = (-2.0, 0.0, 2.0)  # sd; crossings are counted at the impact line shifted by these
 _FEWEST_CONTACT_SAMPLES = 2  # of the folded record in contact, needed for the impact line
 _SAMPLES_PER_UNKNOWN = 10  # samples per unknown of the linear law
 _AVERAGED_SAMPLES = 3  # samples of the moving mean in single periods; a contact lasts longer
-_LINEAR_LAW_UNKNOWNS = 5  # unknowns of the linear law
 _ODDS_OF_A_CYCLE = 3.0  # that a single period shows the true number of contacts
 
 
@@ -251,8 +247,8 @@ class Cycle:
 
     def mean(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean over one sampling step at ``places``, with a sample of every cycle, and its sd for unit noise."""
-        found = local_polynomials(self.phase, values, self.period, self.places, 0.5 * self.step, 0)
-        return found.value, found.sd
+        found, sd = local_polynomials(self.phase, values, self.period, self.places, 0.5 * self.step, 0)
+        return found[0], sd[0]
 
 
 def find_contacts(cycle: Cycle) -> Contacts:
@@ -267,10 +263,11 @@ def find_contacts(cycle: Cycle) -> Contacts:
     if push is None:
         spikes, z, single, levels = (), above[len(above) // 2], single / cycle.noise_sd, CROSSING_LEVELS[-1]
     else:
-        mean, sd = cycle.mean(push.shortfall)
-        z = mean / np.hypot(sd * push.sd, cycle.mean(push.shared_sd)[0])
+        shortfall, noise_sd, shared_sd = push
+        mean, sd = cycle.mean(shortfall)
+        z = mean / np.hypot(sd * noise_sd, cycle.mean(shared_sd)[0])
         spikes = tuple(len(intervals_above(z, *pair)) for pair in SPIKE_LEVELS)
-        single, levels = push.shortfall / np.hypot(push.sd, push.shared_sd), SPIKE_LEVELS[1]
+        single, levels = shortfall / np.hypot(noise_sd, shared_sd), SPIKE_LEVELS[1]
     stretches = intervals_above(z, *levels)
     single = np.convolve(single, np.full(_AVERAGED_SAMPLES, _AVERAGED_SAMPLES**-0.5), mode="same")
     agreeing, cycles = _agreeing_cycles(cycle, single, levels, stretches)
@@ -288,25 +285,16 @@ def find_contacts(cycle: Cycle) -> Contacts:
     return Contacts(count, spikes, crossings, seen, shortest or None, agreeing, cycles, reason)
 
 
-@dataclass(frozen=True)
-class _Shortfall:
-    """Linear law minus acceleration.
-
-    shortfall : (n,) m/s^2
-    sd : of its white noise, m/s^2
-    shared_sd : (n,) m/s^2, from the law and the smoothed x_rel in it; neighbours and periods share this error
-    """
-
-    shortfall: np.ndarray
-    sd: float
-    shared_sd: np.ndarray
+#: Linear law minus acceleration, (n,), the sd of its white noise, and (n,) the sd from the law and the smoothed x_rel in it,
+#: m/s^2; neighbours and periods share this error.
+Shortfall = tuple[np.ndarray, float, np.ndarray]
 
 
-def _shortfall(cycle: Cycle) -> _Shortfall | None:
+def _shortfall(cycle: Cycle) -> Shortfall | None:
     """Linear law minus acceleration; None without one that varies or without enough samples clear of contact."""
     if cycle.acceleration is None or np.ptp(cycle.acceleration) == 0.0:
         return None
-    wide = local_polynomials(
+    wide, _ = local_polynomials(
         cycle.phase,
         cycle.x_rel,
         cycle.period,
@@ -314,28 +302,28 @@ def _shortfall(cycle: Cycle) -> _Shortfall | None:
         max(_NARROW_HALF_WIDTH * cycle.step, _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega),
         3,
     )
-    clear = _clear_of_gap(cycle, wide.value)
-    if clear.sum() < _SAMPLES_PER_UNKNOWN * _LINEAR_LAW_UNKNOWNS:
+    clear = _clear_of_gap(cycle, wide[0])
+    terms = _linear_law_terms(cycle, wide)[clear]
+    if len(terms) < _SAMPLES_PER_UNKNOWN * terms.shape[1]:
         return None
-    terms = _linear_law_terms(cycle, wide.value, wide.rate)[clear]
     scale = np.linalg.norm(terms, axis=0)
     q, triangle = np.linalg.qr(terms / scale)
     law = np.linalg.solve(triangle, q.T @ cycle.acceleration[clear]) / scale
     half = max(_NARROW_HALF_WIDTH, 0.5 * _NARROW_SAMPLES * cycle.period / (len(cycle.time) * cycle.step)) * cycle.step
-    near = local_polynomials(cycle.phase, cycle.x_rel, cycle.period, cycle.phase, half, 3)
-    terms = _linear_law_terms(cycle, near.value, near.rate)
+    near, near_sd = local_polynomials(cycle.phase, cycle.x_rel, cycle.period, cycle.phase, half, 3)
+    terms = _linear_law_terms(cycle, near)
     shortfall = terms @ law - cycle.acceleration
     # A step that exceeds the motion clear of contact hides the noise: what is left is the rounding.
     rounding = float(np.min(np.diff(np.unique(cycle.acceleration)))) / np.sqrt(12.0)
     sd = max(float(np.std(shortfall[clear])), rounding)
     of_law = sd * np.linalg.norm(np.linalg.solve(triangle.T, (terms / scale).T), axis=0)
-    of_terms = cycle.noise_sd * np.hypot(law[1] * near.sd, law[2] * near.rate_sd)
-    return _Shortfall(shortfall, sd, np.hypot(of_law, of_terms))
+    of_terms = cycle.noise_sd * np.hypot(law[1] * near_sd[0], law[2] * near_sd[1])
+    return shortfall, sd, np.hypot(of_law, of_terms)
 
 
-def _linear_law_terms(cycle: Cycle, x_rel: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def _linear_law_terms(cycle: Cycle, local: np.ndarray) -> np.ndarray:
     angle = cycle.Omega * cycle.time
-    return np.stack([np.ones_like(angle), x_rel, rate, np.cos(angle), np.sin(angle)], axis=1)
+    return np.stack([np.ones_like(angle), *local[:2], np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
@@ -343,17 +331,16 @@ def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
     below = x_rel < cycle.gap - max(_CLEARANCE_SDS * cycle.gap_sd, _CLEARANCE_SHARE * float(np.ptp(x_rel)))
     if below.all():
         return below
-    other = np.sort(cycle.phase[~below])
-    other = np.concatenate([other - cycle.period, other, other + cycle.period])
-    after = np.searchsorted(other, cycle.phase).clip(1, len(other) - 1)
-    distance = np.minimum(cycle.phase - other[after - 1], other[after] - cycle.phase)
+    others = KDTree(np.unique(cycle.phase[~below])[:, None], boxsize=cycle.period)
+    distance = np.asarray(others.query(cycle.phase[:, None])[0])
     return below & (distance > _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega)
 
 
-def _impact_line(cycle: Cycle, push: _Shortfall) -> ImpactLine | None:
+def _impact_line(cycle: Cycle, push: Shortfall) -> ImpactLine | None:
     """The x_rel at which the spikes vanish, by regression of x_rel on them."""
-    (force, sd), (x_rel, _) = cycle.mean(push.shortfall), cycle.mean(cycle.x_rel)
-    deep = force > _CONTACT_STANDARD_ERRORS * sd * push.sd
+    shortfall, noise_sd, shared = push
+    (force, sd), (x_rel, _) = cycle.mean(shortfall), cycle.mean(cycle.x_rel)
+    deep = force > BEYOND_CHANCE * sd * noise_sd
     # A mean across an edge of a contact is biased: drop half a sampling step on either side.
     touching = np.all(
         [np.roll(deep, shift) for shift in range(-_PLACES_PER_SAMPLE // 2, _PLACES_PER_SAMPLE // 2 + 1)], axis=0
@@ -361,10 +348,10 @@ def _impact_line(cycle: Cycle, push: _Shortfall) -> ImpactLine | None:
     count = touching.sum() / _PLACES_PER_SAMPLE
     if count < _FEWEST_CONTACT_SAMPLES:
         return None
-    shared_sd = float(np.mean(cycle.mean(push.shared_sd)[0][touching]))
+    shared_sd = float(np.mean(cycle.mean(shared)[0][touching]))
     force, x_rel, sd = force[touching], x_rel[touching], sd[touching]
     # Noise in the regressor reduces the slope: subtract its known variance.
-    variance = float(np.var(force) - np.mean(sd**2) * push.sd**2)
+    variance = float(np.var(force) - np.mean(sd**2) * noise_sd**2)
     if variance <= 0.0:
         return None
     slope = float(np.mean((force - force.mean()) * (x_rel - x_rel.mean())) / variance)

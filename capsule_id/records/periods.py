@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
 from capsule_id.records.tones import noise_level
 from capsule_id.rig.filters import Record
@@ -17,16 +17,6 @@ from capsule_id.rig.filters import Record
 # The sampling step rarely divides the period. Ten periods at 1 kHz then give one period at 10 kHz.
 
 
-@dataclass(frozen=True)
-class Local:
-    """Local polynomials at (m,) places: value, rate per second, and their sd for unit noise."""
-
-    value: Float[np.ndarray, " m"]
-    rate: Float[np.ndarray, " m"]
-    sd: Float[np.ndarray, " m"]
-    rate_sd: Float[np.ndarray, " m"]
-
-
 def local_polynomials(
     phase: Record,
     values: Record,
@@ -34,8 +24,10 @@ def local_polynomials(
     places: Float[np.ndarray, " m"],
     half_width: float,
     order: int,
-) -> Local:
+) -> tuple[Float[np.ndarray, "q m"], Float[np.ndarray, "q m"]]:
     """Least-squares polynomials over windows of a folded record, the folded Savitzky–Golay filter.
+
+    Returns their coefficients at the places, value and rate per second first, and the sds of these for unit noise.
 
     Parameters
     ----------
@@ -44,7 +36,7 @@ def local_polynomials(
     period : s
     places : (m,) s, where the polynomials are evaluated
     half_width : of the window, s; the window is half open and holds at least ``order`` + 1 different phases
-    order : of the polynomial; with 0 the value is a mean and the rate is 0
+    order : of the polynomial, q - 1; with 0 the value is a mean
     """
     sort = np.argsort(phase)
     axis = (phase[sort] + period * np.array([-1.0, 0.0, 1.0])[:, None]).ravel()
@@ -59,10 +51,8 @@ def local_polynomials(
     inverse = np.linalg.inv(np.einsum("mkp,mkq->mpq", design, design))
     weights = np.einsum("mpq,mkq->mpk", inverse, design)
     unknowns = np.einsum("mpk,mk->mp", weights, np.where(inside, y[index], 0.0))
-    none = np.zeros(len(places))
-    rate = unknowns[:, 1] / half_width if order else none
-    rate_sd = np.sqrt(inverse[:, 1, 1]) / half_width if order else none
-    return Local(unknowns[:, 0], rate, np.sqrt(inverse[:, 0, 0]), rate_sd)
+    unit = half_width ** np.arange(order + 1)[:, None]
+    return unknowns.T / unit, np.sqrt(np.einsum("mpp->pm", inverse)) / unit
 
 
 def intervals_above(z: Record, low: float, high: float) -> list[tuple[int, int]]:
@@ -106,20 +96,23 @@ FEWEST_APERIODIC = LONGEST_PERIOD + 2
 DECIDED = 0.9
 #: Prior probability of an aperiodic motion. That of the period n falls as n to this power.
 APERIODIC_PRIOR, PERIOD_EXPONENT = 0.07, -3.0
-#: Ranges of standard deviations with log-uniform priors: cycle-to-cycle scatter of period 1 and of an aperiodic motion,
-#: and the part that repeats after n cycles only. A smaller part counts as a repeat. The largest scatter of period n is
-#: n times smaller: scatter hides the fine bands of long periods.
-PERIODIC_SCATTER, APERIODIC_SCATTER, PART = (0.003, 0.06), (0.02, 1.0), (0.003, 1.0)
+#: Ranges of standard deviations with log-uniform priors: the part that repeats after n cycles only, and the cycle-to-cycle
+#: scatter of period 1 and of an aperiodic motion. A smaller part counts as a repeat, so smaller scatter is no matter. The
+#: largest scatter of period n is n times smaller: scatter hides the fine bands of long periods.
+PART, APERIODIC_SCATTER = (0.003, 1.0), (0.02, 1.0)
+PERIODIC_SCATTER = (PART[0], 0.06)
 #: Largest scatter of most periodic records; above it the prior falls with this power.
 COMMON_SCATTER, SCATTER_EXPONENT = 0.015, 3.0
 #: Largest number of bands of an aperiodic motion, visited in turn.
 MOST_BANDS = 4
-#: A period is decided only where noise and scatter hide no larger part of another one than this.
-LARGEST_HIDDEN = 0.02
+#: A period is decided only where noise and scatter hide no larger part of another one than this: it could be the scatter of
+#: an aperiodic motion.
+LARGEST_HIDDEN = APERIODIC_SCATTER[0]
 #: Correlations of the scatter of successive cycles.
-CORRELATIONS = np.linspace(-0.6, 0.6, 5)
+CORRELATIONS = 0.6 * np.linspace(-1.0, 1.0, 5)
+#: Standard errors of a variance above which what it exceeds is visible.
+VISIBLE = 3.0
 _HIGHEST_DEGREE = 16  # of the polynomial over a cycle; a high degree on few samples amplifies their noise
-_STANDARD_ERRORS = 3.0  # of the power of the scatter at one frequency; a larger part is visible
 _GRID = 25  # standard deviations per range
 _DIFFERENCE_ORDER = 6  # of the differences for the noise level; the motion vanishes in them
 _CYCLES_PER_DRIFT_TERM = 4  # of the polynomial drift, at most quadratic
@@ -242,16 +235,9 @@ def _polynomials(time: Record, x: Record, T: float) -> tuple[Float[np.ndarray, "
     return CubicSpline(time, x)(places) @ np.linalg.pinv(legendre).T, (degree + 1) * step / T
 
 
-@dataclass(frozen=True)
-class _Level:
-    """Frequencies j/m of one m, for each of the correlations (r,): power of the filtered cycles there, filter gain.
-
-    dimensions : number of waves
-    """
-
-    power: Float[np.ndarray, " r"]
-    gain: Float[np.ndarray, " r"]
-    dimensions: int
+#: Frequencies j/m of one m: power of the filtered cycles there and filter gain for each of the correlations, (r,), and the
+#: number of waves.
+Level = tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"], int]
 
 
 class _Evidence:
@@ -271,7 +257,7 @@ class _Evidence:
     def hidden(self, n: int) -> float:
         """Largest part of another period that the noise and the scatter of period n hide, rms."""
         variance = self._noise + self.scatter(n) ** 2
-        return float(np.sqrt(variance * _STANDARD_ERRORS * np.sqrt(2.0 / self._independent) / len(self._cycles)))
+        return float(np.sqrt(variance * VISIBLE * np.sqrt(2.0 / self._independent) / len(self._cycles)))
 
     def scatter(self, n: int) -> float:
         """rms difference of a cycle from the motion of period n beyond the noise, drift removed."""
@@ -292,11 +278,10 @@ class _Evidence:
             parts.append(
                 self._log_evidence(levels[0], np.geomspace(*PART, _GRID)) + np.log(np.sum(prior[self._longest :]))
             )
-        posterior = np.exp(np.array(parts) - np.asarray(logsumexp(parts)))
-        return np.pad(posterior[: self._longest + 1], (0, LONGEST_PERIOD - self._longest))
+        return np.pad(softmax(parts)[: self._longest + 1], (0, LONGEST_PERIOD - self._longest))
 
     def _log_evidence(
-        self, levels: list[_Level], q: Float[np.ndarray, " q"], weight: Float[np.ndarray, " q"] | float = 1.0 / _GRID
+        self, levels: list[Level], q: Float[np.ndarray, " q"], weight: Float[np.ndarray, " q"] | float = 1.0 / _GRID
     ) -> float:
         """Log-likelihood of a period with these levels, integrated over scatters q of prior ``weight`` and the rest.
 
@@ -304,19 +289,19 @@ class _Evidence:
         """
         r = CORRELATIONS[:, None]
         variance = (1.0 + r**2) * self._noise + (1.0 - r**2) * q**2
-        power = np.sum([level.power for level in levels], axis=0)[:, None]
-        dimensions = sum(level.dimensions for level in levels)
+        power = np.sum([own for own, *_ in levels], axis=0)[:, None]
+        dimensions = sum(number for *_, number in levels)
         value = -0.5 * self._independent * (dimensions * np.log(variance) + power / variance)
         part = np.geomspace(*PART, _GRID)[:, None, None]
-        for level in levels[1:]:
+        for own, gain, number in levels[1:]:
             # The likelihood of the level over that of scatter alone, for each variance of the scatter.
-            more = variance + level.gain[:, None] * len(self._cycles) * part**2 / level.dimensions
-            terms = level.dimensions * np.log(more / variance) + level.power[:, None] * (1.0 / more - 1.0 / variance)
+            more = variance + gain[:, None] * len(self._cycles) * part**2 / number
+            terms = number * np.log(more / variance) + own[:, None] * (1.0 / more - 1.0 / variance)
             ratio = logsumexp(-0.5 * self._independent * terms, axis=0) - np.log(_GRID)
-            value = value + (ratio if level is levels[-1] else np.logaddexp(0.0, ratio) - np.log(2.0))
+            value = value + (ratio if own is levels[-1][0] else np.logaddexp(0.0, ratio) - np.log(2.0))
         return float(logsumexp(value + np.log(weight)) - np.log(len(r)))
 
-    def _levels(self, n: int) -> list[_Level]:
+    def _levels(self, n: int) -> list[Level]:
         """What the drift and period n leave of the filtered cycles, then the levels of the divisors of n, n last."""
         last, before = self._cycles[1:], self._cycles[:-1]
         basis, divisors = self._basis(len(last), n)
@@ -325,12 +310,12 @@ class _Evidence:
         power = np.sum((one - r[:, :, None] * other) ** 2, axis=2)
         total = np.array([np.sum((last - x * before) ** 2) for x in CORRELATIONS.tolist()])
         levels, first = [], self._drift_terms
-        rest = _Level(total - np.sum(power, axis=1), np.ones_like(CORRELATIONS), len(last) - basis.shape[1])
+        rest = total - np.sum(power, axis=1), np.ones_like(CORRELATIONS), len(last) - basis.shape[1]
         for m, angles in divisors.items():
             number = sum(1 if 2 * j == m else 2 for j in angles)
             cosine = np.cos(2.0 * np.pi * np.array(angles) / m)
             gain = np.mean(1.0 - 2.0 * r * cosine + r**2, axis=1)
-            levels.append(_Level(np.sum(power[:, first : first + number], axis=1), gain, number))
+            levels.append((np.sum(power[:, first : first + number], axis=1), gain, number))
             first += number
         return [rest, *levels]
 

@@ -9,11 +9,12 @@ from jaxtyping import Num
 from scipy import stats
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
-from scipy.signal import correlate
+from scipy.signal import correlate, find_peaks
 
 from capsule_id.errors import InputError
-from capsule_id.rig.filters import PIECE, Record, dominant_frequency, loudest_part
+from capsule_id.rig.filters import FEWEST_SAMPLES, PIECE, Record, dominant_frequency
 from capsule_id.rig.model import Quantity, Table
+from capsule_id.rig.schema import SHORTEST_RECORD
 
 # stated settings: Settings of a forced run as numbers.
 
@@ -48,27 +49,34 @@ def relative_position(table: Table) -> tuple[np.ndarray, float] | None:
 
 
 def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
-    """Dominant frequency of the loudest part of a record that may be sampled unevenly, Hz."""
-    part = loudest_part(values)
-    even = np.linspace(time[part][0], time[part][-1], len(time[part]))
-    return dominant_frequency(even, np.interp(even, time[part], values[part]))
+    """Dominant frequency of a record that may be sampled unevenly, Hz."""
+    # Times since 1970 have too few digits for an even grid.
+    even = np.linspace(0.0, time[-1] - time[0], len(time))
+    return dominant_frequency(even, np.interp(even, time - time[0], values))
 
 
 # noise: Estimates the noise level of a record from its differences, and finds where a decay is all noise.
 
 
 #: Median of |z| for a standard normal z.
-NORMAL_QUARTILE = 0.6745
+NORMAL_QUARTILE = float(stats.halfnorm.median())
+#: Order of the differences that remove a well-sampled decay.
+ORDER = 3
+#: Standard deviations, or standard errors, that a single value exceeds by chance once in 16,000 times, and that no sample
+#: of a long record does: once in 5e8.
+SIGNIFICANT, BEYOND_CHANCE = 4.0, 6.0
+#: A fit counts as good as the best one if it leaves at most this many times its sum of squares.
+AS_GOOD = 1.5
 #: Part of the energy of a decay before it is all noise.
 ENERGY = 0.99
 
 
-def noise_level(values: Num[np.ndarray, " n"], order: int = 3) -> float:
+def noise_level(values: Num[np.ndarray, " n"], order: int = ORDER) -> float:
     """Standard deviation of the white noise on an evenly sampled record, by the median of its differences.
 
     Differencing removes a smooth motion. The median ignores contacts and stops, which take a small part of the time.
     Of a long record the middle is taken.
-    Order 3 suits a well-sampled decay; order 6 removes a forced motion too.
+    The default suits a well-sampled decay; order 6 removes a forced motion too.
 
     Parameters
     ----------
@@ -95,9 +103,8 @@ def length_of_motion(values: Num[np.ndarray, " n"]) -> int:
 # single tone with unknown frequency: D. C. Rife, R. R. Boorstyn, IEEE Trans. Inf. Theory 20, 591 (1974).
 
 
-#: The stated frequency is wrong if the fitted one differs by this many standard errors and by this fraction of it.
-OMEGA_STANDARD_ERRORS, OMEGA_RELATIVE_DIFFERENCE = 4.0, 1e-3
-FEWEST_SAMPLES = 8  # for five unknowns, including the noise level
+#: The stated frequency is wrong if the fitted one differs by ``SIGNIFICANT`` standard errors and by this fraction of it.
+OMEGA_RELATIVE_DIFFERENCE = 1e-3
 #: A line of the spectrum: its power relative to the highest one, and to its surroundings. Of 611 random decays with other
 #: faults, two had such a line, both clipped and undamped; of 200 with hum or further modes of 5 to 20 %, 183 had one. The
 #: bounds were chosen on these records.
@@ -153,8 +160,8 @@ def fit_harmonic(time: Record, values: Record, Omega: float) -> Harmonic:
     InputError
         With fewer than 8 samples.
     """
-    if len(time) < FEWEST_SAMPLES:
-        rule = f"a tone needs at least {FEWEST_SAMPLES} samples"
+    if len(time) < SHORTEST_RECORD:
+        rule = f"a tone needs at least {SHORTEST_RECORD} samples"
         raise InputError(rule, f"{len(time)}", "record for longer or faster")
     guesses = [Omega]
     # The spectrum needs even sampling; otherwise the stated frequency is the only guess.
@@ -215,9 +222,9 @@ def _residuals(time: Record, values: Record, Omega: float) -> np.ndarray:
 
 
 def _significant_reduction(samples: int) -> float:
-    """Reduction of the sum of squares, relative to the rest, that is as rare as ``OMEGA_STANDARD_ERRORS``."""
+    """Reduction of the sum of squares, relative to the rest, that is as rare as ``SIGNIFICANT``."""
     freedom = samples - 4
-    return float(stats.t.isf(stats.norm.sf(OMEGA_STANDARD_ERRORS), freedom) ** 2 / freedom)
+    return float(stats.t.isf(stats.norm.sf(SIGNIFICANT), freedom) ** 2 / freedom)
 
 
 def _search_half_width(time: Record) -> float:
@@ -283,16 +290,13 @@ def _variances(jacobian: np.ndarray) -> np.ndarray:
 OtherRecord = Num[np.ndarray, " m"]
 
 #: Fewest samples that the two records must share in time.
-FEWEST_COMMON = 50
+FEWEST_COMMON = FEWEST_SAMPLES
 #: Share of the variance of the common signal that the fit must explain.
 LEAST_EXPLAINED = 0.5
 #: A component of the spectrum counts as signal above this many times the mean power of the noise.
 ABOVE_NOISE = 8.0
-#: A sample counts where the slope of the signal exceeds this many times the sd of its noise.
-STEEP = 4.0
-#: Peaks of the correlation above this fraction of the largest one are tried; a fit counts as good as the best one if it
-#: leaves at most this many times its variance unexplained.
-LARGE, AS_GOOD = 0.5, 1.5
+#: Peaks of the correlation above this fraction of the largest one are tried.
+LARGE = 0.5
 _MOST_STARTS, _SAMPLES_OF_A_TRIAL = 8, 3000
 #: Most points of the grid on which a first offset is searched.
 _GRID = 1 << 18
@@ -389,7 +393,7 @@ def _offsets(time: np.ndarray, values: np.ndarray, other_time: np.ndarray, other
     one = np.interp(np.arange(time[0], time[-1], step), time, values - np.mean(values))
     other = np.interp(np.arange(other_time[0], other_time[-1], step), other_time, other_values - np.mean(other_values))
     products = np.abs(correlate(one, other, mode="full", method="fft"))
-    peaks = 1 + np.flatnonzero((products[1:-1] >= products[:-2]) & (products[1:-1] > products[2:]))
+    peaks, _ = find_peaks(products)
     peaks = peaks[products[peaks] >= LARGE * np.max(products[peaks], initial=0.0)]
     peaks = peaks[np.argsort(-products[peaks], kind="stable")][:_MOST_STARTS]
     found = time[0] - other_time[0] + (peaks - (len(other) - 1)) * step
@@ -424,7 +428,7 @@ def _least_squares(
         signal, own, rate = spline(mapped[inside]), values[inside], slope(mapped[inside])
         base = np.column_stack([signal, np.ones(len(own))])
         (gain, constant), *_ = np.linalg.lstsq(base, own, rcond=None)
-        rate = np.where(np.abs(rate) > STEEP * slope_noise, gain * rate, 0.0)
+        rate = np.where(np.abs(rate) > SIGNIFICANT * slope_noise, gain * rate, 0.0)
         design = np.column_stack([rate, rate * (times[inside] - centre), base])
         residual = own - gain * signal - constant
         step, *_ = np.linalg.lstsq(design, residual, rcond=None)

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from capsule_id.errors import InputError
 from capsule_id.records.motion import UNDECIDED, Evidence, MeasuredMotion, measured_motion
 from capsule_id.records.tones import stated_gap
-from capsule_id.rig.filters import filter_gain, sampling_step, savitzky_golay
+from capsule_id.rig.filters import filter_gain, longest_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Table
 
 # view: Prepares a record for figures: filtered, differentiated, sampled at the drive's phase (the paper's Figs. 4, 9,
@@ -19,7 +19,6 @@ from capsule_id.rig.model import Table
 
 
 FILTER_ORDER = 3  # of the filter's polynomial
-SHORTEST_WINDOW = 5  # samples; a shorter window does not smooth at this order
 #: The window is the longest whose gain for a rate is at least this at the contact frequency,
 SMALLEST_RATE_GAIN = 0.9
 #: or, in a record without contacts, at this multiple of the excitation frequency.
@@ -108,7 +107,8 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
     f = evidence.Omega / (2.0 * np.pi)
     contacts = evidence.contacts
     f_contact = 0.5 / contacts.duration if contacts and contacts.duration else None
-    samples = _window_samples(f_contact or PASS_BAND_MULTIPLE * f, step, len(time))
+    highest = f_contact or PASS_BAND_MULTIPLE * f
+    samples = longest_window(highest * step, len(time), FILTER_ORDER, SMALLEST_RATE_GAIN, derivative=1)
     x_rel, rate = (savitzky_golay(time, table["x_rel"], samples * step, FILTER_ORDER, d) for d in (0, 1))
     phase = evidence.drive.phase if evidence.drive else 0.0
     half = samples // 2
@@ -131,14 +131,6 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
         at_drive=_gains(f, step, samples),
         at_contact=_gains(f_contact, step, samples) if f_contact else None,
     )
-
-
-def _window_samples(f: float, step: float, most: int) -> int:
-    """Samples of the longest window that passes the rate at f Hz, at least ``SHORTEST_WINDOW``."""
-    samples = SHORTEST_WINDOW
-    while samples + 2 <= most and filter_gain(f * step, samples + 2, FILTER_ORDER, 1) >= SMALLEST_RATE_GAIN:
-        samples += 2
-    return samples
 
 
 def _gains(f: float, step: float, samples: int) -> Gains:

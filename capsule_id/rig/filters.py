@@ -13,6 +13,7 @@ from bisect import bisect_left
 import numpy as np
 from jaxtyping import Float, Int, Num
 from numpy.polynomial import legendre
+from scipy import signal
 
 from capsule_id.errors import InputError
 from capsule_id.views import counted
@@ -23,6 +24,8 @@ Record = Num[np.ndarray, " n"]
 TIMING_TOLERANCE = 0.01  # largest distance from an even grid, in sampling steps, of evenly spaced samples
 SMALLEST_GAIN = 0.99  # smallest gain of `choose_window` at the dominant frequency
 _HAMPEL_BLOCK = 2_000_000  # readings that are sorted at a time
+#: Fewest samples that show the noise, the levels and the frozen parts of a record; fewer may be single readings.
+FEWEST_SAMPLES = 50
 PIECE = 1 << 18  # samples that are looked at together of a record with twice as many or more
 #: Fewest periods in the loudest part of a record from which its frequency is read.
 FEWEST_PERIODS = 8.0
@@ -89,11 +92,8 @@ def clock_starts(time: Record) -> Int[np.ndarray, " k"]:
 
 
 def median_step(time: Record) -> float:
-    """The median of the steps, s; of a long record that of as many steps as a piece has, at equal distances."""
-    if len(time) < 2 * PIECE:
-        return float(np.median(np.diff(time)))
-    first = np.arange(0, len(time) - 1, len(time) // PIECE)
-    return float(np.median(time[first + 1] - time[first]))
+    """The median of the steps, s."""
+    return float(np.median(np.diff(time)))
 
 
 def largest_offset(time: Record, step: float) -> float:
@@ -177,12 +177,23 @@ def choose_window(time: Record, values: Record, order: int) -> float:
         As ``savitzky_golay``.
     """
     step = sampling_step(time)
-    frequency = dominant_frequency(time, values) * step
-    windows = range(order + 1 + order % 2, len(time) + 1, 2)
-    _check_window(windows.start, order, len(time))
+    _check_window(order + 1 + order % 2, order, len(time))
+    return longest_window(dominant_frequency(time, values) * step, len(time), order, SMALLEST_GAIN) * step
+
+
+def longest_window(frequency: float, most: int, order: int, gain: float, derivative: int = 0) -> int:
+    """Samples of the longest odd window with at least this ``gain`` at a frequency; else of the shortest one that smooths.
+
+    Parameters
+    ----------
+    frequency : cycles per sample
+    most : samples of the record
+    order, derivative : as in ``filter_gain``
+    """
+    windows = range(order + 1 + order % 2, most + 1, 2)
     # The gain falls monotonically from 1 to the stop band, whose ripple is far below 1.
-    too_long = bisect_left(windows, 1, 1, key=lambda samples: filter_gain(frequency, samples, order) < SMALLEST_GAIN)
-    return windows[too_long - 1] * step
+    too_long = bisect_left(windows, 1, 1, key=lambda samples: filter_gain(frequency, samples, order, derivative) < gain)
+    return windows[too_long - 1]
 
 
 def dominant_frequency(time: Record, values: Record) -> float:
@@ -211,10 +222,8 @@ def dominant_frequency(time: Record, values: Record) -> float:
 
 def _highest_peak(values: Record, step: float) -> float:
     """Frequency of the highest peak of the spectrum, Hz, of samples at distances of ``step``, s."""
-    index = np.arange(len(values)) / len(values)
-    residual = values - np.polyval(np.polyfit(index, values, 1), index)
     length = _ZERO_PADDING * len(values)
-    spectrum = np.abs(np.fft.rfft(residual, length))
+    spectrum = np.abs(np.fft.rfft(signal.detrend(values), length))
     # Below 1 / duration a peak is a remainder of the trend.
     return float(np.fft.rfftfreq(length, step)[_ZERO_PADDING + int(np.argmax(spectrum[_ZERO_PADDING:]))])
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from capsule_id.errors import InputError, printable
-from capsule_id.rig.filters import clock_starts
+from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
 from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
 from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile, lines_of
@@ -418,14 +418,13 @@ def _rate(beginning: bytes, names: Sequence[str], singles: dict[int, float]) -> 
 
 Confidence = Literal["sure", "likely", "unsure"]
 TIME = "time"
-#: Fewest rows of a record in time.
-FEWEST_SAMPLES = 50
 #: Score of a unit that fits a column, of the word for the friction that a kind takes, of a column that is left out, and of
 #: one that is the same in every row.
 UNIT_SCORE, MEANT_SCORE, LEFT_OUT, CONSTANT = 1.0, 0.5, -0.25, -2.0
 #: Weight of the range of a column, relative to the largest one, which decides between equal scores only; score of a column
 #: whose name does not fit.
-TIE, _NO_NAME = 1e-3, -1e3
+TIE = 1e-3
+_NO_NAME = -1.0 / TIE
 _LONGEST_HEADER = 40  # characters; a column with a longer header is named by its number
 #: Columns that may be the same in every row, beside those that a kind calls optional.
 SETTINGS = ("length", "speed", "period", "f", "periods")

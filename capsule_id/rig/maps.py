@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from capsule_id.rig.formats.raw import Export, Layout, Place, RawTable
-from capsule_id.rig.model import NO_DRIFT, Column, Instrument, Quantity, Table
+from capsule_id.rig.model import NO_DRIFT, SAME, Column, Instrument, Quantity, Table
 from capsule_id.rig.schema import (
     INSTRUMENT_KEYS,
     ChoiceRule,
@@ -374,8 +374,6 @@ def _wanted(node: Node) -> Wanted:
 # mapped: Applies a column map: selects, combines and scales the columns of one file or several.
 
 
-#: Relative difference below which a column that several files hold is the same.
-ROUNDING = 1e-9
 #: Numbers of a file equal one of ``where`` within this many units in the last place.
 ULPS = 4
 _MOST_VALUES = 6  # shown of a column where no row has the value wanted
@@ -454,7 +452,7 @@ class _Part:
                 )
             same = found[-1] == found[0]
             if not (texts or same.all()):
-                rounding = ROUNDING * float(np.nanmax(np.abs(found[0]), initial=0.0))
+                rounding = SAME * float(np.nanmax(np.abs(found[0]), initial=0.0))
                 same = np.isclose(found[-1], found[0], rtol=0.0, atol=rounding, equal_nan=True)
             if not same.all():
                 one, other = (each[~same].tolist()[0] for each in (found[0], found[-1]))

@@ -20,6 +20,8 @@ class Quantity:
     sd: float = 0.0
 
 
+#: Relative difference below which numbers of two programs are the same, and largest rounding error of a converted number.
+SAME, ROUNDING = 1e-9, 1e-12
 #: A clock that agrees with true time.
 NO_DRIFT = Quantity(0.0)
 
@@ -103,7 +105,7 @@ class Column:
             return 0.0
         gain, offset = (self.instrument.value(symbol) if self.instrument else 0.0 for symbol in ("gain", "offset"))
         values = ((1.0 + gain) * self.values + offset) * self.to_display
-        error = 1e-12 * float(np.max(np.abs(values), initial=0.0))
+        error = ROUNDING * float(np.max(np.abs(values), initial=0.0))
         digits = (10.0**-k for k in range(11) if np.max(np.abs(values - np.round(values, k))) <= error)
         return next(digits, 0.0) / self.to_display / (1.0 + gain)
 

@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from capsule_id.rig.filters import hampel_outliers, median_step
 from capsule_id.rig.formats.raw import Place, RawTable
+from capsule_id.rig.model import SAME
 from capsule_id.rig.schema import ChoiceRule, KindRule, PlainRule, SettingRule, read_rules
 from capsule_id.rig.toml import Node, is_number, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
@@ -76,7 +77,7 @@ def without_outliers(node: Node, raw: RawTable, times: Callable[[RawTable], np.n
     time = times(raw)
     step = median_step(time) if len(time) > 1 else np.inf
     half = stated["window"] / step / 2.0
-    if not 1.0 - 1e-9 <= half <= len(time) / 2.0:
+    if not 1.0 - SAME <= half <= len(time) / 2.0:
         raise node["window"].error(
             "the window must hold two sampling steps or more, and fit into the record",
             f"{stated['window']:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s",
@@ -110,17 +111,9 @@ FEWEST_SAMPLES = 3
 LARGEST_INNER_STEP, LEAST_SHARE = 0.3, 0.1
 
 
-@dataclass(frozen=True)
-class Plateaus:
-    """Stated levels of the column ``name``, in the order of time and in ``unit``.
-
-    ``guard`` is left out before and after each step, s.
-    """
-
-    name: str
-    levels: np.ndarray
-    unit: str
-    guard: float
+#: Name of a column, its stated levels in the order of time, their unit, and the guard, s, left out before and after each
+#: step.
+Plateaus = tuple[str, np.ndarray, str, float]
 
 
 def read_plateaus(entry: Node, kind: KindRule) -> Plateaus | None:
@@ -155,7 +148,7 @@ def read_plateaus(entry: Node, kind: KindRule) -> Plateaus | None:
     )
     node.unit(kind.columns[names[0]].si)
     guard = DurationRule().read(node["guard"]) if "guard" in node else 0.0
-    return Plateaus(names[0], np.array(stated, float), node.value["unit"], guard)
+    return names[0], np.array(stated, float), node.value["unit"], guard
 
 
 def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: Plateaus) -> RawTable:
@@ -174,11 +167,12 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
     """
     channels = [index for index, name in enumerate(raw.names) if name != "time"]
     trace = np.column_stack([raw.columns[index] for index in channels])
-    count = len(plateaus.levels)
+    name, levels, unit, guard = plateaus
+    count = len(levels)
     if len(time) < FEWEST_SAMPLES * count:
         raise node.error(f"{count} plateaus need more samples", f"{len(time)}", "record them for longer")
     edges, block = find_steps(trace, count)
-    guard = plateaus.guard + (block - 1) * float(np.median(np.diff(time)))
+    guard += (block - 1) * median_step(time)
     parts = []
     for first, last in pairwise(edges):
         begins = time[first] + (guard if first > 0 else 0.0)
@@ -192,9 +186,7 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
                 "shorten guard, or state a level for each plateau of the trace",
             )
     means = np.array([trace[part].mean(axis=0) for part in parts])
-    stated, reversed_ = (
-        float(np.corrcoef(order, means[:, 0])[0, 1]) for order in (plateaus.levels, plateaus.levels[::-1])
-    )
+    stated, reversed_ = (float(np.corrcoef(order, means[:, 0])[0, 1]) for order in (levels, levels[::-1]))
     if reversed_ > stated and 1.0 - reversed_ < CLEARLY_LESS * (1.0 - stated):  # every sensitivity is positive
         raise node["levels"].error(
             "the levels must stand in the order of time, and the readings must increase with them",
@@ -210,13 +202,13 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
         )
     _check_constant(node["levels"], trace, parts, means)
     starts = np.array([part[0] for part in parts])
-    names = (*(raw.names[index] for index in channels), plateaus.name)
-    units = (*(raw.units[index] for index in channels), plateaus.unit)
+    names = (*(raw.names[index] for index in channels), name)
+    units = (*(raw.units[index] for index in channels), unit)
 
     def place(row: int | None, column: int) -> Place:
         return raw.place(None if row is None else int(starts[row]), channels[min(column, len(channels) - 1)])
 
-    columns = (*means.T, plateaus.levels)
+    columns = (*means.T, levels)
     return replace(raw, names=names, units=units, columns=columns, rows=raw.rows[starts], place=place)
 
 

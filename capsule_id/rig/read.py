@@ -31,7 +31,7 @@ from capsule_id.rig.maps import (
     refuse_idle_errors,
     without_stated_errors,
 )
-from capsule_id.rig.model import NO_DRIFT, Column, Quantity, Rig, Settings, Table
+from capsule_id.rig.model import NO_DRIFT, ROUNDING, Column, Quantity, Rig, Settings, Table
 from capsule_id.rig.plateaus import read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
@@ -57,7 +57,7 @@ from capsule_id.views import counted
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
 _READING_ERRORS = ("_sd", "_resolution", "_instrument")
 #: Smallest stated reading error relative to the largest reading; below it rounding exceeds the error.
-SMALLEST_RELATIVE_ERROR = 1e-12
+SMALLEST_RELATIVE_ERROR = ROUNDING
 
 
 def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequence[Parameter] = ()) -> Rig:
@@ -388,7 +388,7 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
         # Plateaus replace the time by the column of their levels.
         names = tuple(column_map.sources)
         if plateaus is not None:
-            names = (*(name for name in names if name != "time"), plateaus.name)
+            names = (*(name for name in names if name != "time"), plateaus[0])
         _check_names(names, kind, lambda name, *text: entry["columns"].error(*text))
         exports = {
             name: EXPORTS[suffix_of(file)](contents.pop(name), file, column_map.layout) for name, file in files.items()

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.rig.filters import FEWEST_SAMPLES
 from capsule_id.rig.formats.raw import (
     MOST_TITLES,
     Export,
@@ -24,7 +25,6 @@ from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Shape,
-    any_rows,
     are_words,
     bare,
     cells_of,
@@ -32,8 +32,8 @@ from capsule_id.rig.formats.text import (
     is_row,
     number_in,
     place_of_cell,
-    plain_rows,
     read_column,
+    rows_of,
     shown_cell,
     texts_of,
 )
@@ -44,7 +44,6 @@ from capsule_id.rig.formats.text import (
 # comments; above the numbers they may hold the headers.
 
 
-_MANY_ROWS = 50  # whose whole parts do not increase by chance
 _COMMA_BETWEEN_DIGITS = re.compile(r"\s*([+-]?[0-9]+),[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 
 
@@ -89,9 +88,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
-    rows = plain_rows(file, shape, wanted) if not words and are_words(layout.missing) else None
-    rows = rows or any_rows(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
-
+    rows = rows_of(file, shape, wanted, None, words) if are_words(layout.missing) else None
+    rows = rows or rows_of(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
+    assert rows is not None, "any cell is read with a list of markers"
     lines = rows.lines
 
     def place(row: int | None, column: int) -> Place:
@@ -238,7 +237,7 @@ def delimiter_of(line: str, layout: Layout) -> str | None:
 def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, layout: Layout) -> None:
     """Refuse rows such as ``1,25``: two whole numbers, or one number with a decimal comma.
 
-    Many rows whose whole parts increase from row to row are times and a reading.
+    Rows of a record whose whole parts increase from row to row are times and a reading.
     """
     if delimiter != "," or layout.decimal is not None:
         return
@@ -247,7 +246,7 @@ def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, l
         if (found := _COMMA_BETWEEN_DIGITS.fullmatch(line)) is None:
             return
         wholes.append(int(found[1][:18]))
-    if len(wholes) >= _MANY_ROWS and np.all(np.diff(wholes) > 0):
+    if len(wholes) >= FEWEST_SAMPLES and np.all(np.diff(wholes) > 0):
         return
     raise InputError(
         "a comma between digits must be stated as a separator or a decimal mark",

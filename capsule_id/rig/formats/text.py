@@ -267,38 +267,21 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     return values[:, np.searchsorted(used, columns)]
 
 
-def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | None:
-    """The rows of a text without missing, empty or other cells; None for any other text."""
-    rows = Rows({column: [] for column in columns}, {})
-    for number, text in file.blocks(shape.first):
-        numbers: np.ndarray | list[int] = np.arange(number, number + text.count(b"\n"), dtype=np.int32)
-        values = plain_block(text, shape, columns)
-        if values is None:
-            kept = list(_rows_in(number, text))
-            if not kept:
-                continue
-            numbers, lines = [line for line, _ in kept], [line for _, line in kept]
-            if len(lines) < text.count(b"\n"):  # blank lines or comments
-                values = plain_block("\n".join([*lines, ""]).encode(), shape, columns)
-        if values is None:
-            return None
-        rows.blocks.append(np.asarray(numbers, np.int32) + 1)
-        for index, column in enumerate(columns):
-            rows.numbers[column].append(values[:, index])
-    return rows
-
-
 def are_words(missing: Sequence[str]) -> bool:
     """Whether no missing marker is a number, such as -999: the reader in C would take it for a reading."""
     return all(number_in(marker, mark) is None for marker in missing for mark in ".,")
 
 
-def any_rows(
-    file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str], words: Sequence[int] = ()
-) -> Rows:
+def rows_of(
+    file: TextFile,
+    shape: Shape,
+    columns: Sequence[int],
+    missing: Sequence[str] | None = None,
+    words: Sequence[int] = (),
+) -> Rows | None:
     """The rows of a text, with NaN at a missing marker, and the texts of the columns ``words``.
 
-    Blocks of numbers alone are read by the reader in C.
+    Blocks of numbers alone are read by the reader in C. Without a list ``missing``: None for a text with any other block.
 
     Raises
     ------
@@ -306,32 +289,37 @@ def any_rows(
         If a row has another number of cells than the first one.
     """
     rows = Rows({column: [] for column in columns}, {column: [] for column in words})
-    marks, alone = dict.fromkeys(columns, shape.decimal), not words and are_words(missing)
+    markers, marks = missing or (), dict.fromkeys(columns, shape.decimal)
+    alone = not words and are_words(markers)
     for number, block in file.blocks(shape.first):
         # No other decimal mark than that of the reader in C can be meant.
-        plain = shape.decimal or b"." not in block or {*marks.values()} == {"."}
-        values = plain_block(block, shape, columns) if plain and alone else None
+        plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
+        values = plain_block(block, shape, columns) if plain else None
+        kept = [*_rows_in(number, block)] if values is None else []
+        if values is None and plain and len(kept) < block.count(b"\n"):  # blank lines or comments
+            values = plain_block("\n".join([*(text for _, text in kept), ""]).encode(), shape, columns)
+        if values is None and kept and missing is None:
+            return None
+        lines = [line for line, _ in kept] if kept or values is None else np.arange(number, number + len(values))
+        rows.blocks.append(np.array(lines, np.int32) + 1)
         if values is not None:
-            rows.blocks.append(np.arange(number, number + len(values), dtype=np.int32) + 1)
             for column, one in zip(columns, values.T, strict=True):
                 rows.numbers[column].append(one)
             continue
-        kept = list(_rows_in(number, block))
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
-        rows.blocks.append(np.array([line for line, _ in kept], np.int32) + 1)
         turned = [*zip(*cells, strict=True)] or [()] * shape.width
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
             if column in words:
                 rows.texts[column] += map(sys.intern, texts)
-            marks[column] = marks[column] or decimal_mark(texts, missing)
+            marks[column] = marks[column] or decimal_mark(texts, markers)
 
             def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> Place:
                 line, text = kept[k]
                 return file.path, line + 1, place_of_cell(text, shape.delimiter, column)
 
             try:
-                rows.numbers[column].append(read_column(texts, marks[column] or ".", missing, place))
+                rows.numbers[column].append(read_column(texts, marks[column] or ".", markers, place))
             except InputError as error:
                 rows.numbers[column].append(error)
     return rows
@@ -415,7 +403,7 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")
     shape = Shape(1, delimiter, len(names), decimal)
-    rows = plain_rows(file, shape, range(len(names)))
+    rows = rows_of(file, shape, range(len(names)))
     end = 1 + len(rows.lines) if rows else 1
     # Rows that follow one another, with blank lines alone below them.
     whole = rows and end in rows.lines[-1:].tolist() and not any(line.strip() for line in file.lines(end))
