@@ -33,7 +33,7 @@ from capsule_id.experiments.lint import lint
 from capsule_id.inference.checks.posterior import check_agreement, decisive_readings
 from capsule_id.inference.checks.verdict import beside_stated, record_widenings, run_checks, widenings, with_scaled
 from capsule_id.inference.marginal import MarginalPosterior
-from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.point_fit import point_fit_again
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS, sample
@@ -115,14 +115,14 @@ def sample_posterior(
 
 
 def higher_maximum(point: SampledFit, posterior: Posterior) -> PointFit:
-    """Repeat the point fit from the best draw where the sample has found a higher point than its starts did.
+    """Go on with the point fit from the best draw where the sample has found a higher point than its starts did.
 
     Fits of forced runs stay as they are: they take minutes, and ``check_maximum`` reports the difference.
     """
     best = np.unravel_index(np.argmax(posterior.lp), posterior.lp.shape)
     if posterior.lp[best] <= np.max(point.fit.log_posterior) or any(e.event_driven for e in point.target.experiments):
         return point.fit
-    again = point_fit(point.target, point.seed, further=point.target.unconstrain(posterior.draws[best]))
+    again = point_fit_again(point.target, point.fit, point.target.unconstrain(posterior.draws[best]))
     return again if np.max(again.log_posterior) > np.max(point.fit.log_posterior) else point.fit
 
 

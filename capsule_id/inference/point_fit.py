@@ -92,28 +92,33 @@ LOG_POSTERIOR_FLOOR = -1e12
 BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=40)
 
 
-def point_fit(
-    target: LogPosterior, seed: int, number_of_starts: int = STARTS, further: np.ndarray | None = None
-) -> PointFit:
-    """Maximise the log-posterior from ``number_of_starts`` dispersed starting points.
-
-    Parameters
-    ----------
-    seed : seed of the dispersed starting points
-    further : (d,) u of one more starting point
+def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -> PointFit:
+    """Maximise the log-posterior from ``number_of_starts`` dispersed starting points of this ``seed``.
 
     Starts at fits of simpler models come on top. They are reported only where one of them leads to the highest maximum.
     """
-    starts = dispersed_starts(target, seed, number_of_starts)
-    if further is not None:
-        starts = np.concatenate([starts, further[None]])
-    reported = len(starts)
-    starts = np.concatenate([starts, target.nested_starts()])
-    u, value, converged = _maxima(target, starts)
-    best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
-    kept = np.union1d(np.arange(reported), best)
-    starts, u, value, converged = (each[kept] for each in (starts, u, value, converged))
-    best = int(np.searchsorted(kept, best))
+    starts = np.concatenate([dispersed_starts(target, seed, number_of_starts), target.nested_starts()])
+    maxima = starts, *_maxima(target, starts)
+    kept = np.union1d(np.arange(number_of_starts), _highest(maxima[2]))
+    return _from_maxima(target, *(each[kept] for each in maxima))
+
+
+def point_fit_again(target: LogPosterior, before: PointFit, start: np.ndarray) -> PointFit:
+    """The fit ``before`` with one more start (d,)."""
+    known = before.starts, before.ends, before.log_posterior, ~before.stalled
+    found = start[None], *_maxima(target, start[None])
+    return _from_maxima(target, *(np.concatenate(pair) for pair in zip(known, found, strict=True)))
+
+
+def _highest(value: np.ndarray) -> int:
+    return int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
+
+
+def _from_maxima(
+    target: LogPosterior, starts: np.ndarray, u: np.ndarray, value: np.ndarray, converged: np.ndarray
+) -> PointFit:
+    """The fit at the highest of the maxima u (s, d), which ``starts`` (s, d) led to; see ``_maxima``."""
+    best = _highest(value)
     _, at_fit = linearised(target, u[best])
     root = np.matmul(*_root_of_covariance(target, u[best], at_fit))
     spread = np.sqrt(np.sum(root**2, axis=1))

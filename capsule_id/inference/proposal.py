@@ -192,7 +192,8 @@ class Mixture:
         return student + jacobian + prior
 
     def log_density(self, u: Points) -> PerPoint:
-        return np.logaddexp.reduce(self.components(u), axis=0)
+        with np.errstate(over="ignore"):  # far out squares overflow, and the density is 0
+            return np.logaddexp.reduce(self.components(u), axis=0)
 
     def draw(self, rng: Random, size: int) -> Points:
         """Draw u; NaN where theta is not positive."""

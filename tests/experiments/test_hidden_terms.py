@@ -18,7 +18,7 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments.base import further_columns, refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.hidden_terms import Hidden, check_hidden_terms, hidden_terms
+from capsule_id.experiments.free_vibration.hidden_terms import Hidden, check_hidden_terms, force_responses, hidden_terms
 from capsule_id.experiments.free_vibration.lint import MESSAGES
 from capsule_id.experiments.free_vibration.record import Screened
 from capsule_id.experiments.free_vibration.second_fit import open_models, second_models
@@ -249,3 +249,13 @@ def test_the_f_test_of_one_column_is_the_t_test_of_a_slope() -> None:
     # A column that is a multiple of another counts once, and too few readings tell nothing.
     assert further_columns(np.ones((7, 1)), np.stack([x, 2.0 * x], axis=1), y)[1] == pytest.approx(p, rel=1e-6)
     assert np.isnan(further_columns(np.ones((3, 1)), rng.standard_normal((3, 2)), y[:3])[1])
+
+
+def test_a_fit_far_off_shows_no_force() -> None:
+    """A stiffness with millions of swings between two readings (before: an array larger than the memory)."""
+    table = decay_table(SHORT, VISCOUS)
+    record = FreeVibration(table, bench.rig(table))
+    noise = record.scatters[0]
+    responses = force_responses(record, {**VISCOUS, "k1": 1e24, "c": 0.0, noise: NOISE})
+    assert [np.any(response) for response in responses.values()] == [False] * 3
+    assert np.any(force_responses(record, {**VISCOUS, noise: NOISE})["F_dry"])

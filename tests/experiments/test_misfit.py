@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.experiments.misfit import MANY_NUISANCES, MANY_READINGS, VARIANCES, Misfit, Moments, conditional_draw
+from capsule_id.experiments.misfit import (
+    MANY_NUISANCES,
+    MANY_READINGS,
+    VARIANCES,
+    Misfit,
+    Moments,
+    conditional_draw,
+    conditional_mean,
+)
 
 RNG = np.random.default_rng(5)
 RAW, DESIGN = RNG.standard_normal(7), RNG.standard_normal((7, 3))
@@ -80,3 +88,10 @@ def test_a_draw_of_nuisances_whose_precision_is_lost_in_rounding() -> None:
         draw = conditional_draw(ay, aa - shift * np.trace(aa) * np.eye(2), np.random.default_rng(0))
         assert np.isfinite(draw).all()
         assert np.sum(draw) == pytest.approx(0.7, rel=1e-3)
+
+
+def test_a_mean_of_nuisances_whose_precision_is_lost_in_rounding() -> None:
+    """Two nuisances with one effect, and readings without noise (before: "Singular matrix")."""
+    mean, log_det = conditional_mean(np.full(2, 1e20), np.full((2, 2), 1e20), np)
+    assert np.sum(mean) == pytest.approx(1.0)
+    assert float(log_det) == pytest.approx(np.log(1e20))

@@ -21,8 +21,6 @@ from capsule_id.rig.filters import dominant_frequency
 STRONGEST = 0.7
 #: Smallest |omega^2| relative to omega_0^2: nearer to critical damping the derivative of its root loses all digits.
 CRITICAL = 1e-10
-#: Fewest peaks that show a decrement.
-FEWEST_PEAKS = 3
 #: Smallest peak in standard deviations of the noise.
 PEAK_NOISE_RATIO = 4.0
 #: Smallest peak as a fraction of the record's range, which excludes a noiseless tail. Smoothing rounds the jumps of an
@@ -30,16 +28,16 @@ PEAK_NOISE_RATIO = 4.0
 PEAK_RANGE_RATIO, PEAK_RANGE_RATIO_OF_JUMPS = 0.005, 0.05
 #: A record still swings where its range, or its distance from rest, exceeds this fraction of the whole record's range.
 SWINGING_RATIO = 0.05
-#: Grid of the search for a viscous decay: frequencies from this many rad over the record on, their number, and that of
-#: those near the peak of the spectrum; damping ratios; and number of the best points of a search that are refined.
+#: Grid of the search for a viscous decay: frequencies from this many rad over the record on and their number, damping
+#: ratios of all of them and of those near the peak of the spectrum, and number of its best points that are refined.
 SLOWEST, WIDE_POINTS, NEAR_POINTS, REFINED = 0.3, 48, 9, 3
-RATIOS = np.geomspace(0.001, 3.0, 12)
+LIGHT_RATIOS, STRONG_RATIOS = (0.001, 0.01, 0.03, 0.1), (0.2, 0.4, 0.7, 1.0, 1.5, 3.0)
 #: Limits of the damping ratio of the search, and largest one whose decrement is quoted as a rough value.
 SMALLEST_RATIO, LARGEST_SEARCHED, LARGEST_RATIO = 1e-6, 30.0, 0.9
 #: Unknowns of a viscous decay: k1, c, two initial conditions, offset.
 UNKNOWNS = 5
-#: Samples that are searched: at least, at most on the grid, and at most in the refinement.
-FEWEST_SEARCHED, MOST_SEARCHED, MOST_REFINED = 16, 1000, 20_000
+#: Samples that are searched: at least, at most on the grid, there first for a rough fit, and at most in the refinement.
+FEWEST_SEARCHED, MOST_SEARCHED, MOST_ROUGH, MOST_REFINED = 16, 1000, 100, 20_000
 #: Spectra with fewer periods are checked by a fit; its damping ratio beyond which a spectrum may have no peak.
 FEW_PERIODS, PEAKLESS = 4.0, 0.3
 #: Share of their trace that is added to normal equations, which may be singular.
@@ -111,7 +109,7 @@ class Decrement:
     @property
     def first_ratio(self) -> float:
         """Ratio of the first two amplitudes, at least 1; the mean of neighbouring peaks cancels the error of the rest."""
-        if len(self.peaks) < FEWEST_PEAKS:
+        if len(self.peaks) < 3:
             return float(np.exp(0.5 * max(self.delta, 0.0)))
         first, second, third = np.abs(self.peaks[:3])
         return max(1.0, float((first + second) / (second + third)))
@@ -164,7 +162,9 @@ def logarithmic_decrement(
     smoothed: np.ndarray | None = None,
     jumps: bool = False,
 ) -> Decrement | None:
-    """Apply the paper's estimator to ``values``; None where fewer than ``FEWEST_PEAKS`` half cycles exceed the limits.
+    """Apply the paper's estimator to ``values``; None where fewer than three half cycles exceed the limits.
+
+    Three turning points with samples on either side take five samples.
 
     Parameters
     ----------
@@ -173,12 +173,14 @@ def logarithmic_decrement(
     smoothed : (n,) the record after Savitzky–Golay, which locates the half cycles (default: ``values``)
     jumps : whether the readings may jump where the rod turns, as an acceleration does
     """
+    if len(values) < 5:
+        return None
     rest = equilibrium(values)
     guide = (values if smoothed is None else smoothed) - rest
     smallest = PEAK_RANGE_RATIO_OF_JUMPS if jumps else PEAK_RANGE_RATIO
     lowest = max(PEAK_NOISE_RATIO * noise_level(values), smallest * float(np.ptp(guide)))
     times, peaks = half_cycle_extremes(time, guide, values - rest, lowest)
-    if len(times) < FEWEST_PEAKS:
+    if len(times) < 3:
         return None
     return Decrement.of(np.arange(len(times)), times, peaks, m1)
 
@@ -224,11 +226,13 @@ class ViscousFit(NamedTuple):
         return Decrement(np.array([time]), np.array([peak]), self.omega, delta, m1 * self.square, 2.0 * m1 * self.gamma)
 
 
-def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: int = 0) -> ViscousFit:
+def viscous_fit(
+    time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: int = 0, rough: float = 0.0
+) -> ViscousFit:
     """Fit a viscous decay of any damping to a record of displacements, velocities or accelerations.
 
-    Its motions and the offset are linear. Frequency and damping ratio are searched on a grid, which is denser about the
-    highest peak of the spectrum, then refined by least squares.
+    Its motions and the offset are linear. Frequency and damping ratio are searched on a grid, and about the highest peak
+    of the spectrum where the decay is light, then refined by least squares.
 
     Parameters
     ----------
@@ -236,6 +240,7 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: 
     unknowns : that are searched. 2: a decay. 1: one exponential, which a far overdamped decay leaves of its motion. 3: a
         single stroke, after which dry friction holds the rod; the time of its stop is searched too
     order : of the derivative of x_rel that a stroke is fitted to
+    rough : damping ratio of the grid below which its best point is not refined
     """
     time, size = time - time[0], float(np.std(values)) or 1.0
     rest = np.mean(values[-max(len(values) // 5, 4) :])
@@ -245,7 +250,7 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: 
     peak = 2.0 * np.pi * dominant_frequency(grid, np.interp(grid, time[:end], values[:end]))
     near = peak + np.pi / length * np.linspace(-1.0, 1.0, NEAR_POINTS)
     wide = np.geomspace(SLOWEST / length, np.pi / step, WIDE_POINTS)
-    tried = itertools.product([*near[near > 0.0], *wide], RATIOS)
+    tried = [*itertools.product(near[near > 0.0], LIGHT_RATIOS), *itertools.product(wide, STRONG_RATIOS)]
 
     def fitted(z: np.ndarray, part: slice) -> ViscousFit:
         omega, ratio = np.exp([*z, np.inf][:2])
@@ -253,17 +258,21 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, unknowns: int = 2, order: 
         parts = np.linalg.lstsq(design, values[part])[0]
         return ViscousFit(float(ratio * omega), float(omega**2), parts, values[part] - design @ parts)
 
-    few, fine = (slice(0, end, -(-end // most)) for most in (MOST_SEARCHED, MOST_REFINED))
+    rougher, few, fine = (slice(0, end, -(-end // most)) for most in (MOST_ROUGH, MOST_SEARCHED, MOST_REFINED))
     strongest = LARGEST_SEARCHED if unknowns == 2 else LARGEST_RATIO
     points = np.log([[*pair, 0.9] for pair in tried if unknowns == 2 or pair[1] < LARGEST_RATIO]).T[:unknowns]
     points = np.unique(points, axis=1)
-    # The part of each point in the sum of squares about the mean, by the normal equations.
-    moved = _motions(points, time[few], unknowns, order)
-    moved -= np.mean(moved, axis=1, keepdims=True)
-    square, product = np.swapaxes(moved, 1, 2) @ moved, (values[few] - np.mean(values[few])) @ moved
-    ridge = SINGULAR * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(square.shape[1])
-    taken = np.sum(product * np.linalg.solve(square + ridge, product[..., None])[..., 0], axis=1)
-    starts = points.T[np.argsort(-taken, kind="stable")[:REFINED]]
+    starts = points.T
+    for part in (rougher, few) if rough > 0.0 else (few,):
+        # The part of each point in the sum of squares about the mean, by the normal equations.
+        moved = _motions(points, time[part], unknowns, order)
+        moved -= np.mean(moved, axis=1, keepdims=True)
+        square, product = np.swapaxes(moved, 1, 2) @ moved, (values[part] - np.mean(values[part])) @ moved
+        ridge = SINGULAR * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(square.shape[1])
+        taken = np.sum(product * np.linalg.solve(square + ridge, product[..., None])[..., 0], axis=1)
+        starts = points.T[np.argsort(-taken, kind="stable")[:REFINED]]
+        if rough > 0.0 and np.exp(starts[0][1]) < rough:
+            return fitted(starts[0], slice(None))
     low, high = np.log([[0.1 * SLOWEST / length, SMALLEST_RATIO, 0.01], [np.pi / step, strongest, 1.0]])[:, :unknowns]
     ends = [
         least_squares(lambda z: fitted(z, fine).left / size, np.clip(z, low, high), bounds=(low, high), x_scale=0.1)
@@ -343,5 +352,5 @@ def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:
 
 @lru_cache(maxsize=8)
 def _fit_of(time: bytes, values: bytes) -> ViscousFit:
-    """``viscous_fit`` of bytes of float64: several checks ask for a record's frequency."""
-    return viscous_fit(np.frombuffer(time), np.frombuffer(values))
+    """``viscous_fit`` of bytes of float64, rough where the decay is light: several checks ask for a record's frequency."""
+    return viscous_fit(np.frombuffer(time), np.frombuffer(values), rough=0.5 * PEAKLESS)

@@ -28,8 +28,8 @@ from capsule_id.views import Facts, Finding, Level
 SENSITIVITY_STEP, SMALLEST_C = 1e-5, 0.01
 #: Responses and speeds that are smaller than this, relative to the largest ones, are rounding.
 ROUNDING = 1e-6
-#: Points per period, and fewest points, of the responses to further forces.
-RESPONSE_POINTS, FEWEST_POINTS = 60, 200
+#: Points per period, and fewest and most points, of the responses to further forces.
+RESPONSE_POINTS, FEWEST_POINTS, MOST_POINTS = 60, 200, 1_000_000
 
 
 def sensitivities(
@@ -66,8 +66,10 @@ def force_responses(e: DecayRecord, theta: Mapping[str, float]) -> dict[str, np.
     m1, k1, c = theta["m1"], theta["k1"], theta["c"]
     time = e.time * stretch(e.clock_rate, theta)
     length = float(time[-1])
-    points = max(FEWEST_POINTS, int(RESPONSE_POINTS * length * np.sqrt(k1 / m1) / (2.0 * np.pi)))
-    grid = np.linspace(0.0, length, points)
+    points = RESPONSE_POINTS * length * np.sqrt(k1 / m1) / (2.0 * np.pi)
+    if not points < MOST_POINTS:  # a fit that failed: the rod would swing thousands of times between two readings
+        return dict.fromkeys(FURTHER, np.zeros(len(time)))
+    grid = np.linspace(0.0, length, max(FEWEST_POINTS, int(points)))
     x, rate = viscous_state(grid, theta, parts, e.order)
     system = ([1.0 / m1], [1.0, c / m1, k1 / m1])
     found = {}

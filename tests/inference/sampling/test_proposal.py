@@ -342,3 +342,7 @@ def test_ensembles_do_not_share_moves() -> None:
         Ensemble(known.parts, initial_state(rng.standard_normal((8, 2)), rng), moves).run(2)
     assert len(set(map(id, used))) == 2
     assert moves[0][0] not in used
+
+
+def test_a_place_beyond_the_squares_of_floats_has_no_density() -> None:
+    assert Mixture(np.zeros(2), np.eye(2)).log_density(np.full((1, 2), 1e200)).tolist() == [-np.inf]
