@@ -83,6 +83,8 @@ TOLERANCE, MAXIMUM = 1e-4, 1e-3
 #: by half over one standard deviation. A log-posterior of 500 readings of 4000 sds is rounded to 1e-6, which a step of
 #: 1e-3 made an error of 1e-3.
 GRADIENT_STEP = 2e-2
+#: Largest number of parameters along each of which differences are taken: their time grows with its square.
+MANY = 100
 #: Largest number of quasi-Newton steps.
 MAX_STEPS = 400
 #: Replaces a term of the log-posterior that is not finite, because line searches need a finite number.
@@ -186,10 +188,13 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
 def _polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> tuple[Vector, float, bool]:
     """BFGS from ``end`` (d,) in coordinates whitened by ``roots``: maximum (d,), log-posterior there, converged.
 
-    The differences of its gradient are along the coordinates of the first root alone, whose scatters are still alone.
+    The differences of its gradient are along the white coordinates; of more than ``MANY`` parameters along those of the first
+    root alone, where all scatters share one difference.
     """
-    whitening, rotation = roots
-    alone, d, terms = np.flatnonzero(target.integrated), len(end), terms_of(target)
+    d, terms = len(end), terms_of(target)
+    (whitening, rotation), alone = roots, np.flatnonzero(target.integrated)
+    if d <= MANY:
+        whitening, rotation, alone = whitening @ rotation, np.eye(d), alone[:0]
     rest, steps = np.setdiff1d(np.arange(d), alone), GRADIENT_STEP * directions(d, alone)
 
     def objective(v: Vector) -> tuple[float, Vector]:

@@ -8,6 +8,7 @@ from scipy import optimize
 
 from capsule_id.api import read_rig
 from capsule_id.experiments.kind import make_experiments
+from capsule_id.inference import point_fit as point_module
 from capsule_id.inference.checks.posterior import check_starts
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.point_fit import dispersed_starts, point_fit
@@ -48,6 +49,23 @@ def test_it_is_a_maximum(twin: LogPosterior, fit: PointFit) -> None:
     assert np.max(np.abs(0.5 * (gradient + backward))) < 0.02
     # The curvature of whitened coordinates is 1: forward less backward difference is the step.
     np.testing.assert_allclose((gradient - backward) / step, 1.0, atol=0.02)
+
+
+def test_one_difference_for_all_scatters_leads_to_the_same_maximum(
+    twin: LogPosterior, fit: PointFit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of more than a hundred parameters. From the start alone: it is far from the maximum in every scatter."""
+    rows, batches = [], point_module.in_batches
+    monkeypatch.setattr(point_module, "MANY", 0)
+    monkeypatch.setattr(point_module, "in_batches", lambda f, points: (rows.append(len(points)), batches(f, points))[1])
+    again = point_fit(twin, 5, 1)
+    scatters = int(np.sum(twin.integrated))
+    assert scatters > 3
+    assert 1 + 2 * (twin.dimension - scatters + 1) in rows
+    assert 1 + 2 * twin.dimension not in rows
+    assert not again.stalled.any()
+    assert np.max(np.abs(again.u - fit.u) / np.sqrt(np.diag(fit.covariance))) < 0.01
+    assert again.log_posterior[0] == pytest.approx(np.max(fit.log_posterior), abs=1e-6)
 
 
 def test_springs_against_scipy(twin: LogPosterior, fit: PointFit) -> None:
