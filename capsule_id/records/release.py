@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage
 
-from capsule_id.records.tones import SIGNIFICANT, frequency_of, noise_level
+from capsule_id.records.tones import frequency_of, noise_level
 from capsule_id.rig.filters import PIECE, loudest_part
 
 #: Turning points differ by this fraction of the record's range, and by so many standard deviations of the noise.
@@ -15,14 +14,13 @@ TURN, TURN_SDS = 0.12, 5.0
 #: The last leg between turning points that has this fraction of the largest one belongs to the free decay.
 LEG = 0.3
 #: The part of a leg whose steepest place gives the period, and the time that a cosine takes for it, in periods.
-STEEP = 0.3
-STEEP_TIME = np.arcsin(STEEP) / np.pi
+STEEP, STEEP_TIME = 0.3, 0.097
 #: Where the leg has passed this fraction of its height, the release is past.
 PAST = 0.8
 #: Samples in a period that suffice; of more, means are taken. Fewest of them, and fewest in a window.
 SAMPLES, FEWEST, WINDOW = 100, 4.0, 28
-#: The motion ends where it stays so close to its last value, as a fraction of the range, or closer than the noise.
-STILL = 0.015
+#: The motion ends where it stays so close to its last value: fraction of the range, standard deviations of the noise.
+STILL, STILL_SDS = 0.015, 4.0
 #: Prior sds of dry friction, quadratic damping and a cubic spring, relative to the spring force at the amplitude.
 FURTHER = np.array([0.1, 0.2, 0.1])
 #: Error of the model relative to the amplitude, and what it gains with the sum of the further forces, up to a largest sum.
@@ -146,8 +144,9 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
     later = time[slow + _turning_points(values[slow:])] if len(time) - slow > WINDOW else time[:0]
     if len(later) > 6 and not smooth and later[-1] - later[0] > 1.5 * period * (len(later) - 1):
         width = int((later[-1] - later[0]) / (len(later) - 1) / 4.0 / np.median(np.diff(time)))
-        means = ndimage.uniform_filter1d(values, width, mode="nearest")
-        decay = _find(time_bytes, means.tobytes(), displacement, smooth=True)
+        padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
+        values = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+        decay = _find(time_bytes, values.tobytes(), displacement, smooth=True)
     return decay
 
 
@@ -173,7 +172,7 @@ def _push(time: np.ndarray, values: np.ndarray, start: float, period: float) -> 
 
 def _turning_points(values: np.ndarray) -> np.ndarray:
     """Indices of the turning points that differ by more than noise, and of the ends of the first and the last leg."""
-    levels = ndimage.median_filter(values, 3)[1:-1]
+    levels = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
     limit = max(TURN * float(np.ptp(levels)), TURN_SDS * noise_level(values))
     turns, side, turn, other = list[int](), 0, 0, 0
     levels = levels.tolist()
@@ -196,7 +195,10 @@ def _scale(time: np.ndarray, values: np.ndarray, begin: int, end: int) -> tuple[
     """Period of the oscillation to a factor of two, from the steepest part of a leg, and a time behind its release."""
     passed = np.maximum.accumulate((values[begin : end + 1] - values[begin]) / (values[end] - values[begin]))
     levels = np.linspace(0.0, 1.0, 41)
-    times = np.interp(levels, passed, time[begin : end + 1])
+    place = np.clip(np.searchsorted(passed, levels), 1, len(passed) - 1)
+    low, high = passed[place - 1], passed[place]
+    part = np.where(high > low, (levels - low) / np.where(high > low, high - low, 1.0), 1.0)
+    times = time[begin + place - 1] + np.clip(part, 0.0, 1.0) * (time[begin + place] - time[begin + place - 1])
     steep = round(STEEP * 40)
     return float(np.min(times[steep:] - times[:-steep])) / STEEP_TIME, float(times[round(PAST * 40)])
 
@@ -204,8 +206,10 @@ def _scale(time: np.ndarray, values: np.ndarray, begin: int, end: int) -> tuple[
 def _growth(time: np.ndarray, values: np.ndarray, turns: np.ndarray) -> float | None:
     """Time before legs between ``turns`` that grow; None where none does. Two of them grow, and three were lower."""
     sizes = np.abs(np.diff(values[turns]))
-    highest = ndimage.maximum_filter1d(np.append(sizes[:1], sizes[:-1]), 3, mode="nearest", origin=1)
-    grown = sizes > GROWTH * np.minimum.accumulate(highest) + SMALLEST_PUSH * np.max(sizes)
+    highest = np.max(np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (2, 0), mode="edge"), 3), axis=1)
+    grown = sizes > GROWTH * np.minimum.accumulate(
+        np.concatenate([highest[:1], highest[:-1]])
+    ) + SMALLEST_PUSH * np.max(sizes)
     twice = 1 + np.flatnonzero(grown[1:-1] & grown[2:])
     return float(time[turns[twice[0]]]) if len(twice) else None
 
@@ -237,7 +241,7 @@ class _Record:
         size = max(min(int(period / np.median(np.diff(time)) / SAMPLES), len(time) // WINDOW), 1)
         time, values = (a[: len(a) // size * size].reshape(-1, size).mean(axis=1) for a in (time, values))
         noise, last = noise_level(values), np.median(values[-max(5, len(values) // 20) :])
-        far = np.flatnonzero(np.abs(values - last) > max(SIGNIFICANT * noise, STILL * float(np.ptp(values))))
+        far = np.flatnonzero(np.abs(values - last) > max(STILL_SDS * noise, STILL * float(np.ptp(values))))
         anchor = min(int(np.searchsorted(time, past)), max(len(time) - 10, 0))
         end = max(far[-1] + 1 if len(far) else 0, anchor + 12)
         return cls(time[:end], values[:end], period, noise), anchor
@@ -379,7 +383,7 @@ def _whole(
         omega, zeta = omega * float(np.exp(step[0])), float(np.clip(zeta + step[1], 1e-6, OSCILLATES))
     left = (values - projection.Q @ (projection.Q.T @ values)) / record.noise
     squares, few = np.cumsum(left**2), slice(len(left) // 2)
-    if squares[-1] > len(left) + SIGNIFICANT * np.sqrt(2.0 * len(left)) or np.max(np.abs(step)) > 0.01:
+    if squares[-1] > len(left) + 4.0 * np.sqrt(2.0 * len(left)) or np.max(np.abs(step)) > 0.01:
         return None
     q = projection.Q[few]
     own, shared = np.cumsum(q * left[few, None], axis=0), np.cumsum(q[:, :, None] * q[:, None, :], axis=0)
@@ -480,7 +484,7 @@ def _earlier(record: _Record, row: int, fit: _Fit) -> tuple[float, float | None]
         part = slice(record.at(end - 2.0 * period), record.at(end))
         values, stays = record.values[part], end - time[part.start] > EARLIER * period
         ends_here = end > time[row] - period
-        if len(values) < 6 or np.ptp(values) < 2.0 * SIGNIFICANT * record.noise or not (stays or ends_here):
+        if len(values) < 6 or np.ptp(values) < 2.0 * STILL_SDS * record.noise or not (stays or ends_here):
             continue
         poles = record.fit(part.start, part.stop, [fit.poles], 4).poles if stays else fit.poles
         columns = _motions(poles[0] * (time[part] - end), poles[1])[0]

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.signal import correlate, find_peaks
 
 from capsule_id.errors import InputError
-from capsule_id.rig.filters import FEWEST_SAMPLES, PIECE, Record, dominant_frequency
+from capsule_id.rig.filters import FEWEST_SAMPLES, PIECE, Record, dominant_frequency, loudest_part
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 
@@ -49,10 +49,12 @@ def relative_position(table: Table) -> tuple[np.ndarray, float] | None:
 
 
 def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
-    """Dominant frequency of a record that may be sampled unevenly, Hz."""
+    """Dominant frequency of the loudest part of a record that may be sampled unevenly, Hz."""
+    part = loudest_part(values)
     # Times since 1970 have too few digits for an even grid.
-    even = np.linspace(0.0, time[-1] - time[0], len(time))
-    return dominant_frequency(even, np.interp(even, time - time[0], values))
+    own = time[part] - time[part][0]
+    even = np.linspace(0.0, own[-1], len(own))
+    return dominant_frequency(even, np.interp(even, own, values[part]))
 
 
 # noise: Estimates the noise level of a record from its differences, and finds where a decay is all noise.
