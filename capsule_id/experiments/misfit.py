@@ -61,7 +61,8 @@ def conditional_mean(ay: Any, aa: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
         try:
             return np.linalg.solve(matrix, ay[..., None])[..., 0], np.linalg.slogdet(matrix)[1]
         except np.linalg.LinAlgError:  # readings without noise: rounding takes the identity, the pivots below keep it
-            return tuple(np.asarray(part) for part in conditional_mean(jnp.asarray(ay), jnp.asarray(aa)))
+            mean, log_det = conditional_mean(jnp.asarray(ay), jnp.asarray(aa))
+            return np.asarray(mean), np.asarray(log_det)
 
     def eliminate(k: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
         rows, log_det = carry
