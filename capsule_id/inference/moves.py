@@ -34,13 +34,21 @@ WINDOW = 5.0
 TAILS = (0.05, 0.95)
 
 
+def in_range(draws: Draws) -> Draws:
+    """The draws over a power of two for each parameter: their squares do not overflow, and no digit changes.
+
+    Draws of a parameter that no reading bounds may be as large as 1e150.
+    """
+    return np.ldexp(draws, -np.frexp(np.max(np.abs(draws), axis=(0, 1, 2)))[1])
+
+
 def integrated_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
     """(ensemble, d) integrated autocorrelation time of every ensemble, in draws, by emcee's estimator, for the ESS.
 
     NaN where a walker never moved (after a few draws only).
     """
     with np.errstate(invalid="ignore"):
-        return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in draws])
+        return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in in_range(draws)])
 
 
 def ensemble_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
@@ -89,6 +97,7 @@ def split_rhat(draws: Draws) -> Float[np.ndarray, " d"]:
     Each half of an ensemble, its walkers pooled, is one chain; ``draws`` (ensemble, draw, walker, d).
     """
     half = draws.shape[1] // 2
+    draws = in_range(draws)
     halves = np.concatenate([draws[:, :half], draws[:, draws.shape[1] - half :]])
     chains = halves.reshape(len(halves), -1, draws.shape[-1])
     n = chains.shape[1]
@@ -123,6 +132,7 @@ def geyer_size(draws: Draws) -> Float[np.ndarray, " d"]:
     The sum of autocorrelations ends before the first negative pair of lags, and no pair counts more than one before it.
     """
     half = draws.shape[1] // 2
+    draws = in_range(draws)
     halves = np.concatenate([draws[:, :half], draws[:, draws.shape[1] - half :]])
     chains = np.moveaxis(halves, 1, 2).reshape(-1, half, draws.shape[-1])
     means = np.mean(chains, axis=1, keepdims=True)

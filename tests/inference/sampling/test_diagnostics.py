@@ -7,7 +7,15 @@ import emcee
 import numpy as np
 import pytest
 
-from capsule_id.inference.moves import bulk_and_tail_size, effective_sample_size, ensemble_time, pooled_time, split_rhat
+from capsule_id.inference.moves import (
+    bulk_and_tail_size,
+    effective_sample_size,
+    ensemble_time,
+    geyer_size,
+    integrated_time,
+    pooled_time,
+    split_rhat,
+)
 
 
 def autoregressive(rho: float, shape: tuple[int, int, int, int], seed: int) -> np.ndarray:
@@ -67,6 +75,14 @@ def test_integrated_time_and_ess(rho: float) -> None:
     chains = x.transpose(0, 2, 1, 3).reshape(128, 600, 2)
     expected = [float(arviz.ess(chains[..., i], method="mean")) for i in range(2)]
     np.testing.assert_allclose(ess, expected, rtol=0.1)
+
+
+def test_diagnostics_of_huge_draws_are_those_of_small_ones() -> None:
+    """Draws up to 1e150 of a parameter that no reading bounds. (Before: an overflow.)"""
+    x = autoregressive(0.5, (2, 100, 8, 2), 10)
+    huge = np.ldexp(x, (520, -520))
+    for of in (split_rhat, integrated_time, geyer_size):
+        np.testing.assert_array_equal(of(huge), of(x))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.8])
