@@ -353,4 +353,4 @@ def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:
 @lru_cache(maxsize=8)
 def _fit_of(time: bytes, values: bytes) -> ViscousFit:
     """``viscous_fit`` of bytes of float64, rough where the decay is light: several checks ask for a record's frequency."""
-    return viscous_fit(np.frombuffer(time), np.frombuffer(values), rough=0.5 * PEAKLESS)
+    return viscous_fit(np.frombuffer(time), np.frombuffer(values), rough=PEAKLESS)
