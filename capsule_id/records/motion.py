@@ -168,7 +168,9 @@ def _mean_of_advances(time: Record, values: Record, T: float) -> tuple[float, fl
 SPIKE_LEVELS = ((1.5, 4.5), (2.0, 5.0), (2.5, 6.0))
 CROSSING_LEVELS = ((-1.0, 1.0), (-3.0, 1.0))
 _PLACES_PER_SAMPLE = 8  # grid points per sampling step, on the folded period
-_NARROW_HALF_WIDTH = 1.25  # samples, half-width of the cubic for x_rel and its rate near a contact
+# samples, half-width of the cubic for x_rel and its rate near a contact: where the phases of all cycles together are
+# finer than a sampling step, and where a whole number of steps in a period repeats the same ones, four at least
+_NARROW_HALF_WIDTH, _REPEATED_HALF_WIDTH = 1.25, 2.05
 _NARROW_SAMPLES = 9  # samples of the folded record in the narrow window, at least about this many
 _WIDE_HALF_WIDTH = 0.02  # of the excitation period, half-width for the linear law: rates with little noise
 _CLEARANCE_SHARE = 0.05  # of the range of x_rel: samples this far below the gap are clear of contact,
@@ -245,9 +247,18 @@ class Cycle:
         """Grid on the folded period, s."""
         return np.linspace(0.0, self.period, max(int(_PLACES_PER_SAMPLE * self.period / self.step), 2), endpoint=False)
 
+    @property
+    def narrow(self) -> float:
+        """Half-width, s, of the narrowest window of a cubic."""
+        phase = np.sort(self.phase)
+        widest = np.max(np.diff(phase, append=phase[0] + self.period))
+        return (_REPEATED_HALF_WIDTH if widest > 0.5 * self.step else _NARROW_HALF_WIDTH) * self.step
+
     def mean(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean over one sampling step at ``places``, with a sample of every cycle, and its sd for unit noise."""
-        found, sd = local_polynomials(self.phase, values, self.period, self.places, 0.5 * self.step, 0)
+        # Rounding shall not leave out both samples half a step away.
+        half = 0.5 * (1.0 + 1e-9) * self.step
+        found, sd = local_polynomials(self.phase, values, self.period, self.places, half, 0)
         return found[0], sd[0]
 
 
@@ -299,7 +310,7 @@ def _shortfall(cycle: Cycle) -> Shortfall | None:
         cycle.x_rel,
         cycle.period,
         cycle.phase,
-        max(_NARROW_HALF_WIDTH * cycle.step, _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega),
+        max(cycle.narrow, _WIDE_HALF_WIDTH * 2.0 * np.pi / cycle.Omega),
         3,
     )
     clear = _clear_of_gap(cycle, wide[0])
@@ -309,7 +320,7 @@ def _shortfall(cycle: Cycle) -> Shortfall | None:
     scale = np.linalg.norm(terms, axis=0)
     q, triangle = np.linalg.qr(terms / scale)
     law = np.linalg.solve(triangle, q.T @ cycle.acceleration[clear]) / scale
-    half = max(_NARROW_HALF_WIDTH, 0.5 * _NARROW_SAMPLES * cycle.period / (len(cycle.time) * cycle.step)) * cycle.step
+    half = max(cycle.narrow, 0.5 * _NARROW_SAMPLES * cycle.period / len(cycle.time))
     near, near_sd = local_polynomials(cycle.phase, cycle.x_rel, cycle.period, cycle.phase, half, 3)
     terms = _linear_law_terms(cycle, near)
     shortfall = terms @ law - cycle.acceleration

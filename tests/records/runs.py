@@ -133,12 +133,14 @@ def fresh(seed: int) -> list[tuple[np.ndarray, np.ndarray, float, int]]:
 
 
 @cache
-def reference() -> tuple[Known, ...]:
-    """The 25 reference cases, each as one record."""
+def reference(repeated: bool = False) -> tuple[Known, ...]:
+    """The 25 reference cases, each as one record; ``repeated``: with a whole number of samples in an excitation period."""
     known = []
     for seed, case in enumerate(read_cases().raw):
         parameters = {name: case[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
-        settings = RunSetup("s", case["Omega"], case["P_d"], case["G"], 2000, 1e-3)
+        T = 2.0 * np.pi / case["Omega"]
+        step = T / round(T / 1e-3) if repeated else 1e-3
+        settings = RunSetup("s", case["Omega"], case["P_d"], case["G"], 2000, step)
         run = make_runs({**parameters, "K": 2.0, "k2[s]": case["k2"]}, 100 + seed, (settings,))[0]
         known.append(Known(case["name"], case["label"], 1e-3 * case["mean_velocity_mm_per_s"], run))
     return tuple(known)
