@@ -49,17 +49,32 @@ USUAL: Mapping[str, tuple[float, float]] = {
 #: benches (m1 log-uniform from 10 g to 10 kg, their other ratios scattered by 30 %) none leaves these intervals; of 1,800
 #: masses and columns of theirs that are wrong by 1000 one stays inside.
 MASSES, FORCES, STIFFNESSES, GAPS = (0.03, 150.0), (0.02, 100.0), (0.01, 1000.0), (3e-3, 20.0)
-#: Usual m1 of a rig without m2: no relation judges it.
-MASS_ALONE = (8e-3, 12.0)
+#: Usual m1 of a rig without m2, and force per current and force per deflection of a rig without masses: no relation
+#: judges them, so that an interval is narrower than the prefix of a unit.
+MASS_ALONE, MOTOR_ALONE, SPRING_ALONE = (0.02, 5.0), (0.3, 40.0), (100.0, 1e5)
 #: Usual period of a decay or a drive, s, and amplitude of the acceleration of a decay, m/s^2, which holds the square of
 #: the unit of time.
 USUAL_PERIODS, ACCELERATIONS = (2e-3, 20.0), (3e-3, 1e4)
 #: Factor of a wrong prefix, such as m for mm, and largest distance of a ratio from it, in decades, that it explains.
 PREFIX, NEAR_PREFIX = 1e3, 0.3
-#: Relations between two columns: their names, the words, the SI unit, the value, its usual interval.
+
+
+def _slope(x: np.ndarray, y: np.ndarray) -> float:
+    return float(np.ptp(x) / (np.ptp(y) or 1e-30))
+
+
+#: Relations between two columns: their names, the words, the SI unit, the value, its usual interval, and that without masses.
 RELATIONS = (
-    (("force", "current"), "force per current", "N/A", lambda x, y: np.ptp(x) / (np.ptp(y) or 1e-30), (0.03, 300.0)),
-    (("speed", "distance"), "speed^2/(2 g distance)", "1", lambda x, y: np.median(x**2 / (19.62 * y)), (0.01, 20.0)),
+    (("force", "current"), "force per current", "N/A", _slope, (0.03, 300.0), MOTOR_ALONE),
+    (("force", "deflection"), "force per deflection", "N/m", _slope, (0.0, np.inf), SPRING_ALONE),
+    (
+        ("speed", "distance"),
+        "speed^2/(2 g distance)",
+        "1",
+        lambda x, y: float(np.median(x**2 / (19.62 * y))),
+        (0.01, 20.0),
+        (0.01, 20.0),
+    ),
 )
 #: Units that are mistaken for each other, the likeliest first.
 _ALTERNATIVES: Mapping[str, tuple[str, ...]] = {
@@ -168,9 +183,10 @@ def _numbers(table: Table[Any], kind: Kind, rig: Rig) -> Iterable[Number]:
             usual, others = (GAPS[0] * size, GAPS[1] * size), (f"{label}.x_rel",)
         if usual is not None:
             yield Number(f"{key} of {label}", value, rule.si, usual, (f"{label}.{key}",), label, shared=others)
-    for pair, words, si, relation, usual in RELATIONS:
+    for pair, words, si, relation, usual, alone in RELATIONS:
         if set(pair) <= set(table.columns):
-            value, scales = float(relation(*(table[name] for name in pair))), tuple(f"{label}.{name}" for name in pair)
+            value, scales = relation(*(table[name] for name in pair)), tuple(f"{label}.{name}" for name in pair)
+            usual = alone if rig.m1 is None and rig.m2 is None else usual
             yield Number(f"{words} of {table.file}", value, si, usual, scales, label)
     yield from _against_k1(table, rig)
 

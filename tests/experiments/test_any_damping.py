@@ -232,7 +232,7 @@ def test_a_random_decay_ends_with_a_verdict_or_is_refused(tmp_path: Path, seed: 
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    "seed", [1021, *(pytest.param(s, marks=pytest.mark.slow) for s in (1039, 1057, 1071, 1076, 1078, 1083))]
+    "seed", [1021, *(pytest.param(s, marks=pytest.mark.slow) for s in (1039, 1057, 1071, 1076, 1078, 1083, 1113, 1123))]
 )
 def test_a_random_decay_is_sampled_to_its_verdict(tmp_path: Path, seed: int) -> None:
     """Three readings left for the paper's estimate, and readings without noise (before: a warning, an internal failure).
@@ -269,6 +269,20 @@ def test_a_thousand_random_decays_end_with_a_verdict(tmp_path: Path) -> None:
 def test_random_decays_are_sampled(tmp_path: Path) -> None:
     words = [outcome(tmp_path / str(seed), seed, DEFAULT_BUDGET) for seed in range(1000, 1150)]
     assert len(words) == 150
+
+
+@pytest.mark.full
+def test_readings_without_noise_end_with_a_verdict(tmp_path: Path) -> None:
+    """k1/m1 of more digits than a covariance holds. (Before: a matrix that is not positive definite.)"""
+    time, k1, c, m1 = np.arange(200) / 2000.0, 53946.0, 4.4, 0.11
+    rig = folder(tmp_path, time, 1e-3 * viscous(time, k1, c, m1), m1)
+    np.savez(tmp_path / "d.npz", time=time, x=viscous(time, k1, c, m1))
+    text = re.sub("sd = [^,]*", "sd = 1e-4", (rig / "rig.toml").read_text()).replace("d.csv", "d.npz")
+    columns = '{ time = { from = "time", unit = "s" }, x_rel = { from = "x", unit = "mm" } }'
+    (rig / "rig.toml").write_text(f"{text}columns = {columns}\n")
+    row = cid.fit(cid.read_rig(rig)).summary.loc["k1"]
+    assert row["value"] == pytest.approx(k1, abs=3.0 * row["sd"])
+    assert row["sd"] == pytest.approx(k1 * 1e-4 / m1, rel=0.15)
 
 
 def test_m1_is_not_the_mass_of_the_record(tmp_path: Path) -> None:

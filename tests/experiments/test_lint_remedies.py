@@ -125,7 +125,7 @@ def test_an_aliased_decay_fails_unless_a_prior_excludes_the_aliases(rate: float)
     stiffnesses = [finding.facts["k1"], *map(float, finding.facts["k1s"].split(", "))]
     assert min(abs(np.log(k1 / true)) for k1 in stiffnesses) < 0.1
     # The remedy: a prior that holds the frequency found, and no other.
-    narrow = {"k1": Prior("lognormal", finding.facts["k1"], 1.2)}
+    narrow = {"k1": Prior("lognormal", finding.facts["k1"], finding.facts["alone"])}
     assert found(bench.rig(coarse(rate), priors=narrow), "decays.alias") == []
     # A prior that holds an alias instead does not make the frequency found right.
     if abs(np.log(finding.facts["k1"] / bench.K1)) > 0.5:

@@ -110,6 +110,45 @@ def test_right_units_are_not_named(rig: Rig) -> None:
     assert scales(read_rig(DATA, KINDS)) == []
 
 
+def lone(folder: Path, kind: str, columns: str, rows: str, top: str = "") -> Path:
+    """A folder with one table of ``rows``, such as "0,0 0.5,1"."""
+    folder.mkdir(exist_ok=True)
+    (folder / "d.csv").write_text(columns + "\n" + rows.replace(" ", "\n") + "\n", encoding="utf-8")
+    entry = f'[[experiment]]\nkind = "{kind}"\nfile = "d.csv"\n' + ('spring = "s"\n' if "spring" in kind else "")
+    (folder / "rig.toml").write_text(f'[rig]\nname = "a"\n{top}\n{entry}', encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "columns", "wrong", "named"),
+    [
+        ("motor_current", "current [A],force [N]", "0,0 1,5 2,10", "current [A],force [mN] current [mA],force [N]"),
+        (
+            "support_spring",
+            "deflection [mm],force [N]",
+            "0,0 0.5,9.5 1,19",
+            "deflection [m],force [N] deflection [um],force [N] deflection [mm],force [kN] deflection [mm],force [mN]",
+        ),
+    ],
+)
+def test_a_lone_table_in_a_wrong_unit_is_named(tmp_path: Path, kind: str, columns: str, wrong: str, named: str) -> None:
+    """No mass and no other table judges its scale. (Before: k2 = 19 N/m trusted for 19 kN/m.)"""
+    assert scales(read_rig(lone(tmp_path, kind, columns, wrong), KINDS)) == []
+    headers = re.findall(r"\S+ \S+ \S+", named)
+    assert len(headers) >= 2
+    for header in headers:
+        (finding,) = scales(read_rig(lone(tmp_path, kind, header, wrong), KINDS))
+        confirmed = lone(tmp_path, kind, header, wrong, f"confirmed = {json.dumps(line_of(finding))}")
+        assert scales(read_rig(confirmed, KINDS)) == []
+
+
+@pytest.mark.parametrize(("m1", "named"), [(0.011, True), (0.11, False), (3.0, False), (11.0, True)])
+def test_the_mass_of_a_lone_decay_is_asked_for(tmp_path: Path, m1: float, named: bool) -> None:
+    """11 g as 11 kg (before: k1 = 200 kN/m trusted for 200 N/m)."""
+    rig = read_rig(write(tmp_path / "rig", f'{{ value = {m1}, sd = {1e-3 * m1}, unit = "kg" }}'), KINDS)
+    assert [finding.facts["scales"] for finding in scales(rig)] == ([("m1",)] if named else [])
+
+
 def heavy_and_light(folder: Path) -> Iterator[Rig]:
     """Thirty benches, ten each with m1 of 10 g, 1 kg and 10 kg; other masses, stiffnesses and forces grow with it.
 

@@ -176,6 +176,8 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
             "k1s": ", ".join(dict.fromkeys(f"{k:.4g}" for k in stiffnesses[shown][:3])),
             "range": (low, high),
             "factor": PROPOSED_FACTOR,
+            # As wide as the other frequencies allow: the record itself may know k1 less well.
+            "alone": min(PROPOSED_FACTOR, float(np.exp(0.5 * np.min(np.abs(np.log(stiffnesses / k1)))))),
             "refuted": refuted,
             # A prior would hide a wrong unit.
             "unit": bool(unusual)
@@ -270,7 +272,7 @@ _REFUTED = (
 _ALIAS = (
     "{file}: the sampling cannot tell {frequency:.4g} Hz (k1 = {k1:.4g} N/m) from {others} Hz (k1 = {k1s} N/m).",
     " Sample faster. If {frequency:.4g} Hz is right, state a prior that holds it alone, such as "
-    'k1 = {{ median = {k1:.4g}, factor = 1.2, unit = "N/m" }} in [prior].',
+    'k1 = {{ median = {k1:.2g}, factor = {alone:.2g}, unit = "N/m" }} in [prior].',
 )
 _OUTSIDE = (
     "{file}: k1 = {k1:.4g} N/m lies outside its usual range, {range[0]:.3g} to {range[1]:.3g} N/m. An "

@@ -177,6 +177,9 @@ UNIFORM = 0.6
 LATEST_TURNING_POINT = 0.1
 #: A rough viscous fit whose residuals are this many times the noise misses a force.
 MISFIT = 3.0
+#: Smallest sd of a reading that is not stated, relative to ``width``: that of steps of 18 bits, which good converters
+#: resolve. Readings without noise would determine k1/m1 to more digits than covariances and sums of squares hold.
+FINEST = 2.0**-18 / np.sqrt(12.0) / NUISANCE_WIDTH
 
 
 @dataclass(frozen=True)
@@ -216,7 +219,7 @@ class DecayAbout(About):
 class Decay(SurfaceExperiment):
     """The readings of a decay, with a model of its forces.
 
-    ``time`` (n,), s, and ``values`` (n,), SI, of its first channel; ``reading_sd``, SI, of its readings.
+    ``time`` (n,), s, and ``values`` (n,), SI, of its first channel; ``reading_sd``, SI, of its readings, stated or least.
     """
 
     time: np.ndarray
@@ -356,7 +359,7 @@ class DecayRecord(Decay):
         self.times = ReadingTimes.of(blocks)
         self.relative_sd = np.squeeze(1.0 / np.sqrt(self.times.count))
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
-        self.reading_sd = table.columns[channel_of(table)].reading_sd
+        self.reading_sd = table.columns[channel_of(table)].reading_sd or FINEST * self.width
         self.about = DecayAbout(table, rig, (), screened)
         self.about = replace(self.about, rough=self._rough())
         step = uniform_step(self.time)
@@ -464,7 +467,7 @@ class DecayRecord(Decay):
             return (Misfit(raw, (self.reading_sd * self.relative_sd) ** 2, self.relative_sd, design),)
         columns = xp.concatenate([xp.reshape(raw, (-1, 1)), design], axis=1)
         white = xp.asarray(whiten(self.times, columns, self.model, theta))
-        return (Misfit(white[:, 0], 0.0, 1.0, white[:, 1:]),)
+        return (Misfit(white[:, 0], (FINEST * self.width) ** 2, 1.0, white[:, 1:]),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         if not self.folded.size or xp is np:

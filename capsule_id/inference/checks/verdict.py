@@ -398,6 +398,8 @@ def record_widenings(s: SampledFit) -> dict[str, Widening]:
     estimated = np.array([not is_stated(s.target.names[i]) for i in s.target.located])
     (residuals, jacobian), located = linearised(s.target, s.fit.u), s.target.located[estimated]
     jacobian = jacobian[:, estimated]
+    if not np.isfinite(jacobian).all():  # no start of the fit has found a maximum
+        return {}
     informed = {row.name for e in records for row in e.parameters if row.physical}
     found: dict[str, Widening] = {}
     for division in (by_time, by_phase):
