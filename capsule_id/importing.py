@@ -33,7 +33,6 @@ from capsule_id.rig.guess import (
     source_of,
     times_of,
     unit_of,
-    used_layout,
 )
 from capsule_id.rig.schema import SHORTEST_RECORD, QuantityRule
 from capsule_id.rig.units import UNKNOWN, factor_to_si
@@ -351,14 +350,14 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
             "# [[experiment]]",
             '# kind = "..."',
             f"# file = {json.dumps(file)}",
-            *(f"# {line}" for line in _layout_lines(found, replace(found.layout, missing=()))),
+            *(f"# {line}" for line in _layout_lines(found)),
             '# columns = { ... = { from = 1, unit = "..." } }',
         ]
         return "\n".join(lines) + "\n"
     kind = kinds[guessed.kind]
     lines = [*unread, "[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
-    lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
+    lines += _layout_lines(found)
     lines += _setting_lines(found, guessed, kind)
     lines += ["[experiment.columns]", *_column_lines(found, guessed, kind)]
     return "\n".join(lines) + "\n"
@@ -391,15 +390,14 @@ def _description(found: FoundLayout, content: bytes) -> str:
     return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
 
 
-def _layout_lines(found: FoundLayout, used: Layout) -> Iterable[str]:
+def _layout_lines(found: FoundLayout) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
-    blocks = ", ".join(f"{first} to {last}" for first, last in found.blocks)
+    used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
     longest = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
     for key, value, confidence, reason in (
         ("data_from_line", used.data_from_line, "sure", "the first row of readings"),
         ("data_to_line", used.data_to_line, "likely", longest if len(found.blocks) > 1 else "the last row of readings"),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),
-        ("missing", list(used.missing) or None, "likely", "texts of cells without a reading; their rows are not used"),
     ):
         if value is not None:
             yield _commented(f"{key} = {json.dumps(value, ensure_ascii=False)}", confidence, reason)

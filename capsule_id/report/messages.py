@@ -201,6 +201,18 @@ def _spikes(facts: Facts) -> str:
     )
 
 
+_DROPPED = "{file}: the fit drops {rows:# row} with a missing reading and uses {used}."
+
+
+def _missing(facts: Facts) -> str:
+    """How many readings are missing, where that matters, and what to do."""
+    where = f"That is {100.0 * facts['share']:.1f} %; at most 5 % may be missing"
+    if facts["near"]:
+        where = f"Of these, {facts['near']} in the two periods after the release, where none may be missing"
+    remedy = "If readings are missing because of their size, the result is wrong. Find the cause, or measure again."
+    return filled_in(f"{_DROPPED} {where}. What this file determines is not judged. {remedy}", facts)
+
+
 DATA_MESSAGES: Mapping[str, Message] = {
     "masses.exact": Message(
         "masses", warn="{name}: no sd stated, so its value counts as exact. State the weighing error."
@@ -214,10 +226,8 @@ DATA_MESSAGES: Mapping[str, Message] = {
     ),
     "readings.missing": Message(
         "missing readings",
-        warn=(
-            "{file}: the fit drops {rows:# row} with a missing reading and uses {used}. Check that the losses do not depend on "
-            "the reading."
-        ),
+        ok=_DROPPED,
+        warn=_missing,
     ),
     "readings.rejected": Message(
         "outliers",

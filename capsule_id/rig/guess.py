@@ -17,7 +17,7 @@ from capsule_id.errors import InputError, printable
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
 from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
-from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile, lines_of
+from capsule_id.rig.formats.raw import COMPRESSED, NO_READING, Export, Layout, TextFile, lines_of
 from capsule_id.rig.formats.text import is_row
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale, symbol_named
@@ -166,8 +166,6 @@ def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:
 # rate.
 
 
-#: Texts that loggers and spreadsheets write where a reading is missing.
-MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "#N/A", "?")
 #: Largest share of missing readings in a column of readings.
 MOST_MISSING = 0.5
 _BEGINNING, _MOST_LINES = 100_000, 3_000  # bytes and lines in which the first row of readings is searched
@@ -189,7 +187,7 @@ class FoundLayout:
     Attributes
     ----------
     export : the file as read with ``layout``
-    layout : what ``rig.toml`` must state, with all possible markers
+    layout : what ``rig.toml`` must state
     names, units : of every column, "" where the file has none
     columns : index of a column of readings -> (rows,) numbers, NaN where missing
     unread : index of any other column -> the error at its first cell that is no number
@@ -234,7 +232,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     text = suffix.removesuffix(COMPRESSED) in TEXTS and not suffix.startswith(".lvm")
     beginning = _beginning(TextFile(content, path)) if text else b""
     blocks: tuple[tuple[int, int], ...] = ()
-    layout = Layout(missing=MARKERS)
+    layout = Layout(missing=NO_READING)
 
     def read(layout: Layout) -> tuple[Export, tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]]:
         """The export, and what ``_readings`` finds in it: a column of readings at least."""
@@ -309,21 +307,6 @@ def _cells_of_row(line: str, layout: Layout) -> Cells:
     return (delimiter, len(texts)) if begins else None
 
 
-def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
-    """The layout with the markers alone that occur in the ``used`` columns."""
-    path, numbers = found.export.path, tuple(index + 1 for index in used)
-    missing: tuple[str, ...] = ("NaN",)
-    if not any(np.isnan(found.columns[index]).any() for index in used):
-        missing = ()
-    elif suffix_of(path).removesuffix(COMPRESSED) in TEXTS or suffix_of(path) == ".xlsx":
-        export = EXPORTS[suffix_of(path)](content, path, replace(found.layout, columns=numbers, words=numbers))
-        columns = [export.words(index).tolist() for index in used] if export.words else []
-        everything = (re.split("[\t,]", line) for line in TextFile(content, path).lines())  # of a LabVIEW file
-        cells = set(chain.from_iterable(columns or everything))
-        missing = tuple(marker for marker in MARKERS if marker in cells)
-    return replace(found.layout, missing=missing)
-
-
 def _beginning(file: TextFile) -> bytes:
     """The first ``_MOST_LINES`` lines of a text in UTF-8, about ``_BEGINNING`` bytes of them."""
     text = next(file.blocks(), (0, b""))[1]
@@ -344,7 +327,7 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
     lines = [None, *range(1, min(_MOST_TITLES, beginning.count(b"\n") + 1) + 1)]
     for line in lines:
         for decimal in (None, ".", ","):
-            layout = Layout(line, missing=MARKERS, decimal=decimal)
+            layout = Layout(line, missing=NO_READING, decimal=decimal)
             try:
                 export = read(beginning, path, layout)
             except InputError as error:

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from capsule_id.rig.formats.raw import Export, Layout, Place, RawTable
+from capsule_id.rig.formats.raw import NO_READING, Export, Layout, Place, RawTable
 from capsule_id.rig.model import NO_DRIFT, SAME, Column, Instrument, Quantity, Table
 from capsule_id.rig.schema import (
     INSTRUMENT_KEYS,
@@ -282,7 +282,7 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
         At the key or value of ``rig.toml`` that is wrong.
     """
     stated = read_rules(entry, _LAYOUT)
-    layout = Layout(**{**stated, "missing": tuple(stated.get("missing", ()))})
+    layout = Layout(**{**stated, "missing": (*NO_READING, *stated.get("missing", ()))})
     first, last = layout.data_from_line, layout.data_to_line
     if first is not None and last is not None and last < first:
         raise entry["data_to_line"].error(
@@ -407,7 +407,7 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
         values[name] = np.concatenate(scaled)
     where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
     first_rows = np.cumsum([0, *(part.rows for part in parts)])
-    keep, missing, other = _kept(node, values, where)
+    keep, missing = _kept(node, values, where)
     for name, source in column_map.sources.items():
         if (rate := source.rate) is not None:
             values[name] = np.arange(first_rows[-1]) / rate
@@ -421,8 +421,9 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
     # Arrays of a file may have other lengths than those that the map names.
     rows = np.arange(1, 1 + int(first_rows[-1])) if len(parts) > 1 else first.lines[: int(first_rows[-1])]
     units = tuple(column_map.sources[name].unit for name in names)
-    raw = RawTable(names, units, tuple(values[name] for name in names), rows, place, missing=missing, other=other)
-    return raw if keep.all() else raw.taken(np.flatnonzero(keep))
+    raw = RawTable(names, units, tuple(values[name] for name in names), rows, place)
+    other = int(np.sum(~keep & ~missing))
+    return raw if keep.all() else replace(raw.taken(np.flatnonzero(keep)), lost=rows[missing], other=other)
 
 
 class _Part:
@@ -551,8 +552,8 @@ def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.n
 
 def _kept(
     node: Node, values: Mapping[str, np.ndarray], where: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray, int, int]:
-    """Which rows are used, and how many are dropped: for a missing cell, and outside ``where``."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows are used, and which are dropped for a missing cell; the others lie outside ``where``."""
     everything = np.ones(next(iter(values.values())).size, bool)
     inside = np.all([everything, *(rows for rows, _ in where)], axis=0)
     unknown = np.any([~everything, *(rows for _, rows in where)], axis=0)
@@ -560,5 +561,4 @@ def _kept(
     keep = inside & ~empty
     if not keep.any():
         raise node.error("a table must have rows", "none is left", "correct where, or map another column")
-    missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
-    return keep, missing, keep.size - int(np.sum(keep)) - missing
+    return keep, (inside & empty) | (unknown & ~inside)

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
@@ -132,7 +133,8 @@ class Table(Generic[S]):
     rows : (n,) 1-based line number of every row in the file, read-only; findings name rows by it. Of a table from
         files put one below the other: 1-based number of the row
     bench : its kind is a bench test; else a forced run
-    missing, other : rows of the files that a column map drops: for a missing cell, and outside ``where``
+    lost : (k,) numbers, as in ``rows``, of the rows of the files that are dropped for a missing cell
+    other : number of rows dropped, outside ``where``
     rejected : rows dropped as outliers, by the rule ``reject``
     encodings : of its texts, by file
     drift : of the clock of its times against true time, 1; the times are read with its value
@@ -145,7 +147,7 @@ class Table(Generic[S]):
     settings: S
     rows: np.ndarray
     bench: bool = True
-    missing: int = 0
+    lost: np.ndarray = field(default_factory=partial(np.empty, 0, int))
     other: int = 0
     rejected: int = 0
     encodings: Mapping[str, str] = field(default_factory=dict)
@@ -154,6 +156,11 @@ class Table(Generic[S]):
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""
         return self.columns[name].values
+
+    @property
+    def missing(self) -> int:
+        """Number of rows dropped for a missing cell."""
+        return len(self.lost)
 
     def __repr__(self) -> str:
         columns = ", ".join(f"{column.name} [{column.unit}]" for column in self.columns.values())

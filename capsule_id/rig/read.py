@@ -20,7 +20,6 @@ from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.filters import FEWEST_PERIODS, clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
-from capsule_id.rig.formats.text import MissingCellsError
 from capsule_id.rig.guess import find_layout, proposal
 from capsule_id.rig.maps import (
     MAP_KEYS,
@@ -405,7 +404,7 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
         raw = readings_of_plateaus(entry["plateaus"], raw, _times(raw), plateaus)
     raw.rows.flags.writeable = False
     columns = {column: _to_si(raw, index, kind.columns[column]) for index, column in enumerate(raw.names)}
-    dropped = raw.missing, raw.other, raw.rejected, encodings, drift
+    dropped = raw.lost, raw.other, raw.rejected, encodings, drift
     table = Table(kind.name, label, nodes[0].value, columns, settings, raw.rows, kind.bench, *dropped)
     return table, replace(raw, columns=()), hashes
 
@@ -423,6 +422,8 @@ def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]
     columns = {name: rule for name, rule in kind.columns.items() if name != without}
     sets = tuple(tuple(name for name in names if name != without) for names in kind.sets)
     raw = READERS[path.suffix.lower()](path.read_bytes(), path)
+    if len(raw.lost):
+        raise InputError("settings must have no missing cell", "one", "fill it", path, int(raw.lost[0]), 1)
     _check_names(raw.names, replace(kind, columns=columns, sets=sets), partial(raw.error, None))
     return {name: _to_si(raw, index, columns[name]) for index, name in enumerate(raw.names)}
 
@@ -453,14 +454,10 @@ def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTa
         raw = READERS[suffix](content, file)
         _check_names(raw.names, kind, partial(raw.error, None))
     except InputError as error:
-        lost = isinstance(error, MissingCellsError)
-        if not lost and (error.line != 1 or _A_TRIAL in error.remedy):
+        if error.line != 1 or _A_TRIAL in error.remedy:
             raise
         proposed = _proposal(file, kind, Layout())
         remedy = f"{error.remedy}; or add {proposed} to the experiment, and no other column is read"
-        if lost:
-            proposed += f" and missing = {json.dumps(error.texts, ensure_ascii=False)}"
-            remedy = f"add two lines to the experiment, which drop all rows without a reading: {proposed}"
         raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
     return raw
 

@@ -171,9 +171,8 @@ def test_a_table_with_missing_cells_is_read_at_once(monkeypatch: pytest.MonkeyPa
     number_in = texts.number_in
     monkeypatch.setattr(texts, "number_in", lambda cell, mark: seen.append(cell) or number_in(cell, mark))
     row = ",".join(["1"] * 99) + ",--\n"
-    with pytest.raises(texts.MissingCellsError, match=r"^table.csv:2:199: a cell must be a number, '--'") as caught:
+    with pytest.raises(InputError, match=r"^table.csv:2:199: a cell must not be empty"):
         read_csv((",".join(f"c{i} [1]" for i in range(100)) + "\n" + row * 50).encode(), TABLE)
-    assert caught.value.texts == ("--",)
     assert len(seen) < 10  # two kinds of cells
 
 

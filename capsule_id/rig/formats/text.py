@@ -8,14 +8,14 @@ import sys
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Place, RawTable, TextFile, lines_of, refuse_wide
+from capsule_id.rig.formats.raw import NO_READING, Place, RawTable, TextFile, lines_of, refuse_wide
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -69,7 +69,7 @@ def number_in(cell: str, decimal: str) -> float | None:
     return None if _NUMBER.fullmatch(written) is None else float(written)
 
 
-def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> float:
+def read_number(cell: str, path: Path, line: int, column: int, decimal: str = ".") -> float:
     """One cell as a finite number.
 
     Raises
@@ -78,10 +78,11 @@ def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> 
         At ``line`` and ``column`` if it is no number.
     """
     if not cell:
-        raise InputError("a cell must not be empty", "nothing", "write a number or delete the row", path, line, column)
+        remedy = "write a number; a table must have a row without missing cells"
+        raise InputError("a cell must not be empty", "nothing", remedy, path, line, column)
     value = number_in(cell, decimal)
     if value is None:
-        if cell.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        if cell.lower().lstrip("+-") in ("inf", "infinity"):
             raise InputError("a cell must be a finite number", cell, "delete the row", path, line, column)
         raise InputError(
             "a cell must be a number",
@@ -150,7 +151,7 @@ def read_column(
                 f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row",
                 *place(k),
             )
-        values[k] = read_number(text, mark, *place(k)) if is_beyond_floats(value, text) else value
+        values[k] = read_number(text, *place(k), mark) if is_beyond_floats(value, text) else value
     return values
 
 
@@ -356,21 +357,11 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
 # 1-based: the line of the file, and the character of that line at which the cell begins.
 
 
-#: What exports write where there is no reading, in small letters, without signs.
-_NO_READING = ("", "nan", "inf", "infinity", "na", "n/a", "#n/a", "null", "none")
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 
 
-class MissingCellsError(InputError):
-    """Cells without a reading: the error of the first one, with the ``texts`` of all."""
-
-    def __init__(self, first: InputError, texts: tuple[str, ...]) -> None:
-        super().__init__(first.rule, first.value, first.remedy, first.file, first.line, first.column)
-        self.texts = texts
-
-
 def read_csv(content: bytes, path: Path) -> RawTable:
-    """Read a CSV table.
+    """Read a CSV table; rows with a missing cell (``NO_READING``) are left out.
 
     Parameters
     ----------
@@ -413,7 +404,11 @@ def read_csv(content: bytes, path: Path) -> RawTable:
         line = 0 if row is None else row + 1
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    return RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
+    raw = RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
+    missing = np.any(np.isnan(columns), axis=0)
+    if missing.all():  # the first cell of the first row that holds none
+        read_number("", *raw.place(0, int(np.argmax([np.isnan(column[0]) for column in columns]))))
+    return replace(raw.taken(np.flatnonzero(~missing)), lost=raw.rows[missing]) if missing.any() else raw
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -436,9 +431,8 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
 
 
 def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
-    """The columns, read cell by cell; raises at the first fault, and at missing readings where there is no other."""
+    """The columns, read cell by cell, with NaN at missing ones; raises at the first fault."""
     path, columns, mark, blank = file.path, shape.width, shape.decimal or ".", None
-    missing: dict[str, InputError] = {}
     values = array("d")
 
     @lru_cache(1 << 16)  # short cells are many, but many of them are the same
@@ -478,16 +472,8 @@ def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
             )
         row = [*map(number, cells)]
         values.extend(row)
-        for column in (k for k, one in enumerate(row) if math.isnan(one) and cells[k] not in missing):
-            cell, place = cells[column], place_of_cell(text, shape.delimiter, column)
-            try:
-                read_number(cell, mark, path, line, place)
-            except InputError as error:
-                if cell.lower().strip("+-") not in _NO_READING:
-                    raise
-                missing[cell] = error
-    if missing:
-        raise MissingCellsError(next(iter(missing.values())), tuple(missing))
+        for column in (k for k, one in enumerate(row) if math.isnan(one) and bare(cells[k]) not in NO_READING):
+            read_number(cells[column], path, line, place_of_cell(text, shape.delimiter, column), mark)
     if not values:
         raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
     return tuple(np.array(values).reshape(-1, columns).T.copy())
