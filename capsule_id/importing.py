@@ -16,7 +16,7 @@ from capsule_id.records.release import find_free_decay
 from capsule_id.records.tones import estimate_clock, frequency_of
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats.layouts import delimiter_of
-from capsule_id.rig.formats.raw import Layout, TextFile
+from capsule_id.rig.formats.raw import TextFile
 from capsule_id.rig.guess import (
     TIME,
     Assignment,
@@ -35,6 +35,7 @@ from capsule_id.rig.guess import (
     unit_of,
 )
 from capsule_id.rig.schema import SHORTEST_RECORD, QuantityRule
+from capsule_id.rig.times import evened
 from capsule_id.rig.units import UNKNOWN, factor_to_si
 from capsule_id.views import counted
 
@@ -355,7 +356,8 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
         ]
         return "\n".join(lines) + "\n"
     kind = kinds[guessed.kind]
-    lines = [*unread, "[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
+    lines = [*unread, *_unused_lines(found, guessed, kind)]
+    lines += ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found)
     lines += _setting_lines(found, guessed, kind)
@@ -373,6 +375,21 @@ def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str
         if ":" in error.value and fits_name(name, TIME) > 0:
             remedy = "Export times as seconds, or state the sampling rate."
         yield f"#: {found.names[index]!r} is not read: line {error.line} has {' '.join(error.value.split())}. {remedy}"
+
+
+def _unused_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
+    """A comment that names the columns which the entry does not use."""
+    columns = [each for column in guessed.columns.values() for each in (column, *column.rivals)]
+    used = {column.index for column in columns}
+    names = [repr(name) for index, name in enumerate(found.names) if name and index not in used]
+    more = f" and {counted(len(names) - _SHOWN_COLUMNS, 'more column')}" if len(names) > _SHOWN_COLUMNS else ""
+    if names:
+        yield f"#: Not used: {', '.join(names[:_SHOWN_COLUMNS])}{more}."
+    weighed = [(i, unit_of(found.header(i, ["kg"])[1], ["kg"])) for i in found.columns if i not in used]
+    index, unit = next(((i, unit) for i, unit in weighed if unit in ("kg", "g", "lb")), (0, None))
+    if unit and "normal_force" in kind.optional and "normal_force" not in guessed.columns:
+        source = f'normal_force = {{ from = {source_of(found, index)}, unit = "{unit}f" }}'
+        yield f"#: If {found.names[index]!r} is the mass that presses on the track, add to the columns: {source}"
 
 
 def _commented(line: str, confidence: str, reason: str) -> str:
@@ -418,6 +435,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[s
     time, values = times_of_guess(found, guessed), found.columns[guessed.columns[channel].index]
     here = np.isfinite(values) & np.isfinite(time)
     time, values = time[here], values[here]
+    time = time if (done := evened(time)) is None else done.times
     if "samples" in kind.setting_rules and are_turning_points(values):
         reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
         yield _commented('samples = "turning_points"', "unsure", reason)

@@ -234,7 +234,7 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
             for file, encoding in table.encodings.items()
             if encoding == WINDOWS
         ]
-        findings += _missing(table)
+        findings += (*_missing(table), *(replace(found, experiment=table.label) for found in table.findings))
         facts = {"file": table.file, "rows": table.rejected, "used": len(table.rows)}
         findings += [Finding("readings.rejected", "warn", facts, table.label)] * bool(table.rejected)
         for lint_table in kinds[table.kind].lint:

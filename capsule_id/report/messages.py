@@ -229,6 +229,32 @@ DATA_MESSAGES: Mapping[str, Message] = {
         ok=_DROPPED,
         warn=_missing,
     ),
+    "times.stamps": Message(
+        "time stamps", ok="{file}: {rows:# time stamp} are read as seconds since the first one, over midnight too."
+    ),
+    "times.records": Message(
+        "several records",
+        ok="{file}: the clock starts anew at lines {lines}. The {records} records are fitted as so many experiments.",
+    ),
+    "times.copies": Message(
+        "repeated rows",
+        warn="{file}:{line}: {rows:# row} repeat the row before, time and readings. The fit drops them. Check the export.",
+    ),
+    "times.held": Message(
+        "repeated times",
+        warn=(
+            "{file}:{line}: {rows:# time stamp} repeat the one before, because the clock stood still and then made up for it. "
+            "These rows get times between their neighbours. Check the logger."
+        ),
+    ),
+    "times.ticks": Message(
+        "rounded times",
+        warn=(
+            "{file}:{line}: the times are rounded to {tick:.4g} {unit}: {rows:# row} repeat the time before. No stamp "
+            "contradicts even samples, so the fit takes a step of {step:.6g} {unit} from their number. "
+            "Its relative sd, {sd:.1g}, is in the uncertainties. Export times with more digits."
+        ),
+    ),
     "readings.rejected": Message(
         "outliers",
         warn=(

@@ -86,7 +86,7 @@ def thinned(values: Record) -> Num[np.ndarray, " m"]:
 
 def clock_starts(time: Record) -> Int[np.ndarray, " k"]:
     """Rows at which the clock of successive records starts anew; () where times are out of order instead."""
-    falls = 1 + np.flatnonzero(np.diff(time) <= 0.0)
+    falls = 1 + np.flatnonzero(np.diff(time) < 0.0)
     anew = time[falls] <= time[0] + CLOCK_START * np.ptp(time)
     return falls if len(falls) * FEWEST_PERIODS < len(time) and anew.all() else falls[:0]
 

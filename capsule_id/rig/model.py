@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 
 from capsule_id.parameters import Prior
-from capsule_id.views import counted
+from capsule_id.views import Finding, counted
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,8 @@ class Table(Generic[S]):
     rejected : rows dropped as outliers, by the rule ``reject``
     encodings : of its texts, by file
     drift : of the clock of its times against true time, 1; the times are read with its value
+    findings : what was done to its times
+    entry : index of its ``[[experiment]]``, which may hold several records
     """
 
     kind: str
@@ -152,6 +154,8 @@ class Table(Generic[S]):
     rejected: int = 0
     encodings: Mapping[str, str] = field(default_factory=dict)
     drift: Quantity = NO_DRIFT
+    findings: tuple[Finding, ...] = ()
+    entry: int = 0
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""

@@ -91,9 +91,14 @@ def test_first_readings_may_be_the_release(tmp_path: Path) -> None:
 def test_a_warning_leaves_the_parameters_of_the_table_not_judged() -> None:
     names = {"d": ("k1", "c"), "pull": ("mu",)}
     experiments: Any = [
-        SimpleNamespace(label=label, table=SimpleNamespace(label=label), masses=(), parameters=[SimpleNamespace(name=n) for n in own])
+        SimpleNamespace(
+            label=label,
+            table=SimpleNamespace(label=label),
+            masses=(),
+            parameters=[SimpleNamespace(name=name) for name in own],
+        )
         for label, own in names.items()
-    ]  # fmt: skip
+    ]
     found = Finding("readings.missing", "warn", {"unjudged": True}, "d")
     assert with_scaled(found, experiments).parameters == ("k1", "c")
     assert not with_scaled(Finding("readings.missing", "ok", {"unjudged": False}, "d"), experiments).parameters

@@ -358,6 +358,10 @@ class Export:
 # arrays: Makes an export of named arrays: the form of every format without lines.
 
 
+#: Names, in small letters, of a number that is the sampling rate, Hz, or its inverse, s; of an attribute, those of a unit.
+RATE_NAMES = ("fs", "rate", "sampling_rate", "sample_rate", "samplerate", "samplingrate", "sampling_frequency")
+STEP_NAMES = ("dt", "ts", "sample_time", "sampling_interval", "sample_interval")
+UNIT_NAMES = ("unit", "units", "unit_string", "ni_unitdescription")
 #: A matrix this many times as wide as high holds its channels in rows.
 WIDE = 10
 

@@ -9,6 +9,7 @@ from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from datetime import date
 from functools import lru_cache
 from pathlib import Path
 
@@ -159,6 +160,85 @@ def shown_cell(cell: str) -> str:
     """A faulty cell for an error line: printable and short."""
     text = repr(cell)
     return text if len(text) <= _LONGEST_QUOTED else text[:_LONGEST_QUOTED] + "…"
+
+
+# stamps: Dates and times of day as seconds since the first one.
+
+
+#: A date, which may be left out, and a time of day or of an hour: 2024-03-01T12:34:56.789+01:00, 12:34:56,789, 34:56.8.
+_STAMP = re.compile(
+    r"(?:(?:(?P<year>\d{4})[-/.](?P<month>\d\d?)[-/.](?P<day>\d\d?)|(?P<one>\d\d?)(?P<mark>[-/.])(?P<two>\d\d?)[-/.](?P<last>\d{4}|\d\d))"
+    r"(?:T|,? +))?(?P<h>\d{1,3}):(?P<min>\d\d)(?::(?P<s>\d\d)(?:[.,:](?P<part>\d{1,9}))?|[.,](?P<tail>\d{1,9}))"
+    r"(?: ?(?P<half>[AaPp])\.?[Mm]\.?)?(?: ?(?:Z|UTC|GMT|(?P<zone>[+-]\d\d):?(?P<zone_min>\d\d)))?"
+)
+_SECOND, _HOUR = 10**9, 3600 * 10**9  # ns
+
+
+def is_stamp(cell: str) -> bool:
+    """Whether a cell is a time stamp."""
+    return ":" in cell and _STAMP.fullmatch(cell) is not None
+
+
+def seconds_of_stamps(texts: Sequence[str], missing: Sequence[str], place: Callable[[int], Place]) -> np.ndarray:
+    """Seconds since the first of these stamps, (n,); NaN at a missing one. Without a date, a fall is the next day, or hour.
+
+    Raises
+    ------
+    InputError
+        At the first text that is no stamp, or where the dates are none.
+    """
+    found = [_STAMP.fullmatch(text) for text in texts]
+    wrong = next(
+        (k for k, (text, one) in enumerate(zip(texts, found, strict=True)) if not one and text not in missing), None
+    )
+    known = [k for k, one in enumerate(found) if one]
+    if wrong is not None or not known:
+        wrong = wrong or 0
+        remedy = "correct the cell, or state the unit of the numbers, such as s"
+        rule = "a time stamp must be a time of day, such as 12:34:56.789, with or without a date"
+        raise InputError(rule, shown_cell(texts[wrong]), remedy, *place(wrong))
+    stamps = [one for one in found if one]
+    clocks = np.array([_clock(one) for one in stamps])
+    days = list[np.ndarray]()
+    for first in ("one", "two"):
+        with suppress(ValueError):
+            days.append(np.array([_day(one, first) for one in stamps]))
+    if not days:
+        raise InputError(
+            "the date of a time stamp must exist", shown_cell(texts[known[0]]), "correct it", *place(known[0])
+        )
+    turn = 24 * _HOUR if stamps[0]["tail"] is None else _HOUR
+    day = min(days, key=np.ptp)  # 03/04/2024: the order of day and month that makes the record shorter
+    if not day.any():
+        day = np.cumsum(np.diff(clocks, prepend=clocks[0]) < -turn // 2)
+    total = day * turn + clocks
+    values = np.full(len(texts), np.nan)
+    values[known] = (total - total[0]) / _SECOND
+    return values
+
+
+def _clock(stamp: re.Match[str]) -> int:
+    """The time of day of a stamp in Greenwich, ns; without seconds that of an hour."""
+    units = [int(stamp["h"]), int(stamp["min"]), int(stamp["s"] or 0)]
+    if stamp["half"]:
+        units[0] = units[0] % 12 + 12 * (stamp["half"] in "Pp")
+    units = units if stamp["tail"] is None else [0, *units[:2]]
+    if stamp["zone"]:
+        sign = -1 if stamp["zone"][0] == "-" else 1
+        units = [units[0] - int(stamp["zone"]), units[1] - sign * int(stamp["zone_min"]), units[2]]
+    seconds = (units[0] * 60 + units[1]) * 60 + units[2]
+    return seconds * _SECOND + int((stamp["part"] or stamp["tail"] or "").ljust(9, "0"))
+
+
+def _day(stamp: re.Match[str], first: str) -> int:
+    """The number of the day of a stamp, 0 without a date; ``first``: which of two numbers is the day, if no point follows."""
+    if stamp["year"]:
+        return date(int(stamp["year"]), int(stamp["month"]), int(stamp["day"])).toordinal()
+    if not stamp["one"]:
+        return 0
+    day, month = ("one", "two") if first == "one" or stamp["mark"] == "." else ("two", "one")
+    year = int(stamp["last"])
+    return date(year + 2000 * (year < 100), int(stamp[month]), int(stamp[day])).toordinal()
 
 
 # rows: Reads rows of numbers from a text in blocks: quickly where all cells are numbers, else cell by cell.
