@@ -356,7 +356,7 @@ def read_tables(
     stamps: tuple[Finding, ...] = ()
     if column_map is not None and any(source.unit == STAMP for source in column_map.sources.values()):
         stamps = (Finding("times.stamps", "ok", {"file": nodes[0].value, "rows": len(raw.rows)}),)
-    increasing = "time" in raw.names and "time" in kind.columns and plateaus is None
+    increasing = "time" in raw.names and "time" in kind.columns and plateaus is None and len(nodes) == 1
     records = records_of(raw, nodes[0].value) if increasing else [Record(raw)]
     labels = [label] if len(records) == 1 else [f"{label}_{k + 1}" for k in range(len(records))]
     tables = []
