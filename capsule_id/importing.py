@@ -16,7 +16,7 @@ from capsule_id.records.release import find_free_decay
 from capsule_id.records.tones import estimate_clock, frequency_of
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats.layouts import delimiter_of
-from capsule_id.rig.formats.raw import Layout, TextFile
+from capsule_id.rig.formats.raw import TextFile
 from capsule_id.rig.guess import (
     TIME,
     Assignment,
@@ -33,9 +33,9 @@ from capsule_id.rig.guess import (
     source_of,
     times_of,
     unit_of,
-    used_layout,
 )
 from capsule_id.rig.schema import SHORTEST_RECORD, QuantityRule
+from capsule_id.rig.times import evened
 from capsule_id.rig.units import UNKNOWN, factor_to_si
 from capsule_id.views import counted
 
@@ -351,14 +351,15 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
             "# [[experiment]]",
             '# kind = "..."',
             f"# file = {json.dumps(file)}",
-            *(f"# {line}" for line in _layout_lines(found, replace(found.layout, missing=()))),
+            *(f"# {line}" for line in _layout_lines(found)),
             '# columns = { ... = { from = 1, unit = "..." } }',
         ]
         return "\n".join(lines) + "\n"
     kind = kinds[guessed.kind]
-    lines = [*unread, "[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
+    lines = [*unread, *_unused_lines(found, guessed, kind)]
+    lines += ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
-    lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
+    lines += _layout_lines(found)
     lines += _setting_lines(found, guessed, kind)
     lines += ["[experiment.columns]", *_column_lines(found, guessed, kind)]
     return "\n".join(lines) + "\n"
@@ -376,6 +377,21 @@ def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str
         yield f"#: {found.names[index]!r} is not read: line {error.line} has {' '.join(error.value.split())}. {remedy}"
 
 
+def _unused_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
+    """A comment that names the columns which the entry does not use."""
+    columns = [each for column in guessed.columns.values() for each in (column, *column.rivals)]
+    used = {column.index for column in columns}
+    names = [repr(name) for index, name in enumerate(found.names) if name and index not in used]
+    more = f" and {counted(len(names) - _SHOWN_COLUMNS, 'more column')}" if len(names) > _SHOWN_COLUMNS else ""
+    if names:
+        yield f"#: Not used: {', '.join(names[:_SHOWN_COLUMNS])}{more}."
+    weighed = [(i, unit_of(found.header(i, ["kg"])[1], ["kg"])) for i in found.columns if i not in used]
+    index, unit = next(((i, unit) for i, unit in weighed if unit in ("kg", "g", "lb")), (0, None))
+    if unit and "normal_force" in kind.optional and "normal_force" not in guessed.columns:
+        source = f'normal_force = {{ from = {source_of(found, index)}, unit = "{unit}f" }}'
+        yield f"#: If {found.names[index]!r} is the mass that presses on the track, add to the columns: {source}"
+
+
 def _commented(line: str, confidence: str, reason: str) -> str:
     """A line with the confidence of its guess as a comment."""
     return f"{line}  # {confidence}: {' '.join(reason.split())}"
@@ -391,15 +407,14 @@ def _description(found: FoundLayout, content: bytes) -> str:
     return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
 
 
-def _layout_lines(found: FoundLayout, used: Layout) -> Iterable[str]:
+def _layout_lines(found: FoundLayout) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
-    blocks = ", ".join(f"{first} to {last}" for first, last in found.blocks)
+    used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
     longest = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
     for key, value, confidence, reason in (
         ("data_from_line", used.data_from_line, "sure", "the first row of readings"),
         ("data_to_line", used.data_to_line, "likely", longest if len(found.blocks) > 1 else "the last row of readings"),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),
-        ("missing", list(used.missing) or None, "likely", "texts of cells without a reading; their rows are not used"),
     ):
         if value is not None:
             yield _commented(f"{key} = {json.dumps(value, ensure_ascii=False)}", confidence, reason)
@@ -420,6 +435,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[s
     time, values = times_of_guess(found, guessed), found.columns[guessed.columns[channel].index]
     here = np.isfinite(values) & np.isfinite(time)
     time, values = time[here], values[here]
+    time = time if (done := evened(time)) is None else done.times
     if "samples" in kind.setting_rules and are_turning_points(values):
         reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
         yield _commented('samples = "turning_points"', "unsure", reason)

@@ -47,5 +47,5 @@ def test_no_text_writes_one_rows() -> None:
 
 def test_findings_count_one_row_as_one() -> None:
     messages = messages_of(default_registry())
-    text = messages["readings.missing"].text("warn", {"file": "a.csv", "rows": 1, "used": 9})
+    text = messages["readings.missing"].text("warn", {"file": "a.csv", "rows": 1, "used": 9, "share": 0.1, "near": 0})
     assert text.startswith("a.csv: the fit drops 1 row with a missing reading and uses 9.")

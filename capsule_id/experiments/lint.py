@@ -19,6 +19,7 @@ from capsule_id.records.faults import (
     noisy_stretch,
     time_rounding,
 )
+from capsule_id.records.release import find_free_decay
 from capsule_id.records.tones import frequency_of
 from capsule_id.rig.filters import TIMING_TOLERANCE, hampel_outliers, largest_offset, median_step
 from capsule_id.rig.formats.raw import WINDOWS
@@ -249,12 +250,40 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
             for file, encoding in table.encodings.items()
             if encoding == WINDOWS
         ]
-        for code, rows in (("readings.missing", table.missing), ("readings.rejected", table.rejected)):
-            facts = {"file": table.file, "rows": rows, "used": len(table.rows)}
-            findings += [Finding(code, "warn", facts, table.label)] * bool(rows)
+        findings += (*_missing(table), *(replace(found, experiment=table.label) for found in table.findings))
+        facts = {"file": table.file, "rows": table.rejected, "used": len(table.rows)}
+        findings += [Finding("readings.rejected", "warn", facts, table.label)] * bool(table.rejected)
         for lint_table in kinds[table.kind].lint:
             findings += lint_table(table, rig)
     return (*with_line(findings, rig), *_repeated(rig, tables))
+
+
+#: Largest share of missing readings that does not count; those in so many periods from a release on always do.
+MOST_MISSING, AFTER_RELEASE = 0.05, 2.0
+
+
+def _missing(table: Table[Any]) -> Iterable[Finding]:
+    """Report rows with a missing reading; a warning where they can change a result."""
+    if not table.missing:
+        return
+    rows, behind, near, times = len(table.rows), np.searchsorted(table.rows, table.lost), 0, table.columns.get("time")
+    # What is missing behind the last reading of a record is no gap in it.
+    within = int(np.sum(behind < rows)) if times is not None else table.missing
+    if times is not None and table.bench and rows >= SHORTEST_RECORD:
+        stated = (getattr(table.settings, key, None) for key in ("start", "stop"))
+        low, high = (end if value is None else value for value, end in zip(stated, (-np.inf, np.inf), strict=True))
+        used = (times.values >= low) & (times.values <= high)
+        time, values = times.values[used], table[next(name for name in table.columns if name != "time")][used]
+        decay = find_free_decay(time, values)
+        start = time[0] if decay is None or decay.start <= time[0] else decay.start
+        period = 1.0 / frequency_of(time, values) if decay is None else decay.period
+        # Of a missing row the next one in use is known; the last rows before the release may be the release.
+        next_one = times.values[np.minimum(behind, rows - 1)]
+        near = int(np.sum((next_one >= start) & (next_one <= start + AFTER_RELEASE * period) & (behind < rows)))
+    share = within / (rows + within)
+    many = share > MOST_MISSING or near > 0
+    facts = {"file": table.file, "rows": table.missing, "used": rows, "share": share, "near": near, "unjudged": many}
+    yield Finding("readings.missing", "warn" if many else "ok", facts, table.label)
 
 
 def lint_settings(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> tuple[Finding, ...]:
@@ -366,9 +395,12 @@ def lint_times(table: Table[Any], used: slice) -> Iterable[Finding]:
     """
     time = table["time"][used]
     gaps = find_gaps(time)
-    if gaps is not None:
-        counts = {"gaps": len(gaps.rows), "lost": int(gaps.lost.sum()), "step": gaps.step}
-        yield _fault(table, "readings.gaps", used.start + gaps.rows, "warn", **counts)
+    if gaps is not None:  # rows that are counted as missing are no gap
+        missing = np.bincount(np.searchsorted(table.rows, table.lost), minlength=used.stop + 1)
+        kept = missing[used.start + gaps.rows + 1] < gaps.lost
+        rows, lost = used.start + gaps.rows[kept], int(gaps.lost[kept].sum())
+        if len(rows):
+            yield _fault(table, "readings.gaps", rows, "warn", gaps=len(rows), lost=lost, step=gaps.step)
         return
     rounding = time_rounding(time)
     if rounding is not None:

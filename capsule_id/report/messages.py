@@ -201,6 +201,18 @@ def _spikes(facts: Facts) -> str:
     )
 
 
+_DROPPED = "{file}: the fit drops {rows:# row} with a missing reading and uses {used}."
+
+
+def _missing(facts: Facts) -> str:
+    """How many readings are missing, where that matters, and what to do."""
+    where = f"That is {100.0 * facts['share']:.1f} %; at most 5 % may be missing"
+    if facts["near"]:
+        where = f"Of these, {facts['near']} in the two periods after the release, where none may be missing"
+    remedy = "If readings are missing because of their size, the result is wrong. Find the cause, or measure again."
+    return filled_in(f"{_DROPPED} {where}. What this file determines is not judged. {remedy}", facts)
+
+
 DATA_MESSAGES: Mapping[str, Message] = {
     "masses.exact": Message(
         "masses", warn="{name}: no sd stated, so its value counts as exact. State the weighing error."
@@ -214,9 +226,33 @@ DATA_MESSAGES: Mapping[str, Message] = {
     ),
     "readings.missing": Message(
         "missing readings",
+        ok=_DROPPED,
+        warn=_missing,
+    ),
+    "times.stamps": Message(
+        "time stamps", ok="{file}: {rows:# time stamp} are read as seconds since the first one, over midnight too."
+    ),
+    "times.records": Message(
+        "several records",
+        ok="{file}: the clock starts anew at lines {lines}. The {records} records are fitted as so many experiments.",
+    ),
+    "times.copies": Message(
+        "repeated rows",
+        warn="{file}:{line}: {rows:# row} repeat the row before, time and readings. The fit drops them. Check the export.",
+    ),
+    "times.held": Message(
+        "repeated times",
         warn=(
-            "{file}: the fit drops {rows:# row} with a missing reading and uses {used}. Check that the losses do not depend on "
-            "the reading."
+            "{file}:{line}: {rows:# time stamp} repeat the one before, because the clock stood still and then made up for it. "
+            "These rows get times between their neighbours. Check the logger."
+        ),
+    ),
+    "times.ticks": Message(
+        "rounded times",
+        warn=(
+            "{file}:{line}: the times are rounded to {tick:.4g} {unit}: {rows:# row} repeat the time before. No stamp "
+            "contradicts even samples, so the fit takes a step of {step:.6g} {unit} from their number. "
+            "Its relative sd, {sd:.1g}, is in the uncertainties. Export times with more digits."
         ),
     ),
     "readings.rejected": Message(

@@ -29,7 +29,7 @@ FEWEST_SAMPLES = 50
 PIECE = 1 << 18  # samples that are looked at together of a record with twice as many or more
 #: Fewest periods in the loudest part of a record from which its frequency is read.
 FEWEST_PERIODS = 8.0
-#: Largest time at which a clock starts anew, relative to the longest record.
+#: Largest difference of the time at which a clock starts anew from the first one, relative to the longest record.
 CLOCK_START = 0.02
 _ZERO_PADDING = 8  # the frequency grid of the spectrum is 8 times finer than 1 / duration
 
@@ -85,9 +85,12 @@ def thinned(values: Record) -> Num[np.ndarray, " m"]:
 
 
 def clock_starts(time: Record) -> Int[np.ndarray, " k"]:
-    """Rows at which the clock of successive records starts anew; () where times are out of order instead."""
-    falls = 1 + np.flatnonzero(np.diff(time) <= 0.0)
-    anew = time[falls] <= time[0] + CLOCK_START * np.ptp(time)
+    """Rows at which the clock of successive records starts anew; () where times are out of order instead.
+
+    A clock that falls to another time than the first one was set, or the parts are out of order.
+    """
+    falls = 1 + np.flatnonzero(np.diff(time) < 0.0)
+    anew = np.abs(time[falls] - time[0]) <= CLOCK_START * np.ptp(time)
     return falls if len(falls) * FEWEST_PERIODS < len(time) and anew.all() else falls[:0]
 
 

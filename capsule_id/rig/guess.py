@@ -17,10 +17,20 @@ from capsule_id.errors import InputError, printable
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
 from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
-from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout, TextFile, lines_of
-from capsule_id.rig.formats.text import is_row
+from capsule_id.rig.formats.raw import (
+    COMPRESSED,
+    NO_READING,
+    RATE_NAMES,
+    STEP_NAMES,
+    Export,
+    Layout,
+    TextFile,
+    lines_of,
+)
+from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps
 from capsule_id.rig.schema import KindRule
-from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale, symbol_named
+from capsule_id.rig.times import evened
+from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si, scale, symbol_named
 
 # headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
 
@@ -29,7 +39,7 @@ from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale, symbol
 #: the uncertainty of any, and parts of the names of frictions.
 WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in {
     "time": "time t zeit messzeit temps tiempo tempo elapsed timestamp clock value duree instant istante "
-    "instante zeitstempel",
+    "instante zeitstempel datetime datumzeit uhrzeit heure hora ora",
     "x_rel": "relative displacement disp deflection position pos x s weg laser distance abstand auslenkung "
     "ausschlag verschiebung elongation desplazamiento deplacement spostamento posicion posizione "
     "elongacion elongazione distancia distanza amplitude amplitudes peak",
@@ -166,8 +176,6 @@ def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:
 # rate.
 
 
-#: Texts that loggers and spreadsheets write where a reading is missing.
-MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "#N/A", "?")
 #: Largest share of missing readings in a column of readings.
 MOST_MISSING = 0.5
 _BEGINNING, _MOST_LINES = 100_000, 3_000  # bytes and lines in which the first row of readings is searched
@@ -179,7 +187,6 @@ Cells = tuple[str | None, int] | None
 #: Cells of successive rows, their number, and the lines of the first and the last one, counted from 1.
 Run = tuple[Cells, int, int, int]
 _RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
-_RATE_NAMES = ("fs", "rate", "sampling_rate", "sample_rate", "samplerate")
 
 
 @dataclass(frozen=True)
@@ -189,11 +196,12 @@ class FoundLayout:
     Attributes
     ----------
     export : the file as read with ``layout``
-    layout : what ``rig.toml`` must state, with all possible markers
+    layout : what ``rig.toml`` must state
     names, units : of every column, "" where the file has none
     columns : index of a column of readings -> (rows,) numbers, NaN where missing
     unread : index of any other column -> the error at its first cell that is no number
     rate : sampling rate that the file states, Hz
+    stamps : indices of the columns of time stamps, in seconds since the first one
     blocks : first and last line of each block of readings, counted from 1, of a text with other lines between or below
         them, of which ``export`` holds the longest; else ()
     """
@@ -205,11 +213,14 @@ class FoundLayout:
     columns: dict[int, np.ndarray]
     unread: dict[int, InputError]
     rate: float | None
+    stamps: frozenset[int] = frozenset()
     blocks: tuple[tuple[int, int], ...] = ()
 
     def header(self, index: int, dimensions: Sequence[str]) -> tuple[str, str]:
         """Name of a column, and the text of its unit: that of its header, else that of the row of units, or ""."""
         name, text = name_and_unit(self.names[index], dimensions)
+        if index in self.stamps:
+            return name if fits_name(name, TIME) > 0 else TIME, STAMP
         return name, (text or self.units[index]).strip()
 
 
@@ -234,7 +245,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     text = suffix.removesuffix(COMPRESSED) in TEXTS and not suffix.startswith(".lvm")
     beginning = _beginning(TextFile(content, path)) if text else b""
     blocks: tuple[tuple[int, int], ...] = ()
-    layout = Layout(missing=MARKERS)
+    layout = Layout(missing=NO_READING)
 
     def read(layout: Layout) -> tuple[Export, tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]]:
         """The export, and what ``_readings`` finds in it: a column of readings at least."""
@@ -259,7 +270,22 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
         export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
-    return FoundLayout(export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
+    stamps = {index: values for index in unread if (values := _stamps(content, export, layout, index)) is not None}
+    read_too = {index: error for index, error in unread.items() if index not in stamps}
+    rate = _rate(beginning, names, singles)
+    return FoundLayout(export, layout, names, units, {**columns, **stamps}, read_too, rate, frozenset(stamps), blocks)
+
+
+def _stamps(content: bytes, export: Export, layout: Layout, index: int) -> np.ndarray | None:
+    """A column of time stamps that increase, (n,) s since the first one; None for another column."""
+    layout = replace(layout, columns=(index + 1,), words=(index + 1,))
+    with suppress(InputError):
+        again = EXPORTS[suffix_of(export.path)](content, export.path, layout)
+        if again.words is not None:
+            texts = again.words(index).tolist()
+            values = seconds_of_stamps(texts, layout.missing, lambda row: again.place(row, index))
+            return values if np.nanmax(values) > 0.0 and increases(values) else None
+    return None
 
 
 def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
@@ -305,23 +331,8 @@ def _cells_of_row(line: str, layout: Layout) -> Cells:
     """Separator and number of cells of a line that begins with a number, or a missing one before others; else None."""
     delimiter = delimiter_of(line, layout)
     texts = split_bare(line, delimiter)
-    begins = is_number(texts[0]) or (texts[0] in layout.missing and any(map(is_number, texts)))
+    begins = is_number(texts[0]) or is_stamp(texts[0]) or (texts[0] in layout.missing and any(map(is_number, texts)))
     return (delimiter, len(texts)) if begins else None
-
-
-def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
-    """The layout with the markers alone that occur in the ``used`` columns."""
-    path, numbers = found.export.path, tuple(index + 1 for index in used)
-    missing: tuple[str, ...] = ("NaN",)
-    if not any(np.isnan(found.columns[index]).any() for index in used):
-        missing = ()
-    elif suffix_of(path).removesuffix(COMPRESSED) in TEXTS or suffix_of(path) == ".xlsx":
-        export = EXPORTS[suffix_of(path)](content, path, replace(found.layout, columns=numbers, words=numbers))
-        columns = [export.words(index).tolist() for index in used] if export.words else []
-        everything = (re.split("[\t,]", line) for line in TextFile(content, path).lines())  # of a LabVIEW file
-        cells = set(chain.from_iterable(columns or everything))
-        missing = tuple(marker for marker in MARKERS if marker in cells)
-    return replace(found.layout, missing=missing)
 
 
 def _beginning(file: TextFile) -> bytes:
@@ -344,7 +355,7 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
     lines = [None, *range(1, min(_MOST_TITLES, beginning.count(b"\n") + 1) + 1)]
     for line in lines:
         for decimal in (None, ".", ","):
-            layout = Layout(line, missing=MARKERS, decimal=decimal)
+            layout = Layout(line, missing=NO_READING, decimal=decimal)
             try:
                 export = read(beginning, path, layout)
             except InputError as error:
@@ -403,8 +414,9 @@ def _headers(export: Export, dimensions: Sequence[str]) -> tuple[tuple[str, ...]
 def _rate(beginning: bytes, names: Sequence[str], singles: dict[int, float]) -> float | None:
     """The sampling rate stated in the titles of a text, or by a number with the name of a rate, Hz."""
     for column, value in singles.items():
-        if names[column].lower() in _RATE_NAMES and value > 0.0:
-            return value
+        name = re.split(r"[./]", names[column].lower())[-1]  # a field of a struct, an attribute of a group
+        if name in (*RATE_NAMES, *STEP_NAMES) and value > 0.0:
+            return value if name in RATE_NAMES else 1.0 / value
     for line in beginning.decode("utf-8", "replace").splitlines()[:_MOST_TITLES]:
         found = _RATE.search(line)
         if found:
@@ -518,7 +530,8 @@ def readings_of(found: FoundLayout, column: ColumnGuess, si: str, *, finite: boo
 def increases(values: np.ndarray) -> bool:
     """Whether times increase; a clock may start anew."""
     values = values[np.isfinite(values)]
-    return int(np.sum(np.diff(values) <= 0.0)) == len(clock_starts(values))
+    parts = np.split(values, clock_starts(values))
+    return all(np.all(np.diff(part) > 0.0) or evened(part) is not None for part in parts)
 
 
 def times_of(found: FoundLayout) -> list[int]:

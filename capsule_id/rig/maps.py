@@ -3,12 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from types import MappingProxyType
 
 import numpy as np
 
-from capsule_id.rig.formats.raw import Export, Layout, Place, RawTable
+from capsule_id.rig.formats.raw import NO_READING, Export, Layout, Place, RawTable
+from capsule_id.rig.formats.text import seconds_of_stamps
 from capsule_id.rig.model import NO_DRIFT, SAME, Column, Instrument, Quantity, Table
 from capsule_id.rig.schema import (
     INSTRUMENT_KEYS,
@@ -21,7 +23,7 @@ from capsule_id.rig.schema import (
     read_rules,
 )
 from capsule_id.rig.toml import ANY, Node, is_count, is_number, remedy_for, shown
-from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si
+from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si
 
 # clock: Puts the times of a record on the clock of another logger: ``clock = { offset = {...}, drift = {...} }``.
 #
@@ -282,7 +284,7 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
         At the key or value of ``rig.toml`` that is wrong.
     """
     stated = read_rules(entry, _LAYOUT)
-    layout = Layout(**{**stated, "missing": tuple(stated.get("missing", ()))})
+    layout = Layout(**{**stated, "missing": (*NO_READING, *stated.get("missing", ()))})
     first, last = layout.data_from_line, layout.data_to_line
     if first is not None and last is not None and last < first:
         raise entry["data_to_line"].error(
@@ -312,6 +314,7 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
         for form in (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))
     ]
     words = tuple(form for form, value in keys if isinstance(value, str))
+    words += tuple(source.header for source in sources.values() if source.unit == STAMP)
     layout = replace(layout, columns=(*named, *(form for form, _ in keys)), words=words)
     return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(wanted))
 
@@ -332,7 +335,12 @@ def _source(node: Node, rule: ColumnRule) -> Source:
         raise node["scale"].error(
             "scale must not be 0", "0", "write 1, or -1 for the other sign; for a constant, state it as offset"
         )
-    return Source(header, _header(node["minus"]) if "minus" in node else None, node.value["unit"], scale, offset)
+    unit, further = node.value["unit"], node.value.keys() - {"from", "unit"}
+    if unit == STAMP and further:
+        raise node[min(further)].error(
+            f"time stamps have no {min(further)}", "one", "remove it; clock shifts times", of_key=True
+        )
+    return Source(header, _header(node["minus"]) if "minus" in node else None, unit, scale, offset)
 
 
 def _header(node: Node) -> Header:
@@ -398,19 +406,12 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
     parts = [_Part([each]) for each in exports] if alike else [_Part(exports)]
     node = entry["columns"]
     sources = {name: source for name, source in column_map.sources.items() if source.rate is None}
-    found = [{name: part.find(node[name]["from"], source.header) for name, source in sources.items()} for part in parts]
+    found = [
+        {name: part.find(node[name]["from"], source.header, source.unit == STAMP) for name, source in sources.items()}
+        for part in parts
+    ]
     # The numbers of the files are not kept beside the table.
     places = [{name: place for name, (_, place) in here.items()} for here in found]
-    values: dict[str, np.ndarray] = {}
-    for name, source in sources.items():
-        scaled = [_scaled(part, here.pop(name)[0], node[name], source) for part, here in zip(parts, found, strict=True)]
-        values[name] = np.concatenate(scaled)
-    where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
-    first_rows = np.cumsum([0, *(part.rows for part in parts)])
-    keep, missing, other = _kept(node, values, where)
-    for name, source in column_map.sources.items():
-        if (rate := source.rate) is not None:
-            values[name] = np.arange(first_rows[-1]) / rate
     names = tuple(column_map.sources)
 
     def place(row: int | None, column: int) -> Place:
@@ -418,11 +419,28 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
         here = places[part].get(names[column]) or next(iter(places[part].values()))
         return here(None if row is None else row - int(first_rows[part]))
 
+    first_rows = np.cumsum([0, *(part.rows for part in parts)])
+    values: dict[str, np.ndarray] = {}
+    for name, source in sources.items():
+        own = [here.pop(name)[0] for here in found]
+        if source.unit == STAMP:
+            texts = np.concatenate(own).tolist()
+            values[name] = seconds_of_stamps(texts, column_map.layout.missing, partial(place, column=names.index(name)))
+            continue
+        scaled = [_scaled(part, one, node[name], source) for part, one in zip(parts, own, strict=True)]
+        values[name] = np.concatenate(scaled)
+    where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
+    keep, missing = _kept(node, values, where)
+    for name, source in column_map.sources.items():
+        if (rate := source.rate) is not None:
+            values[name] = np.arange(first_rows[-1]) / rate
+
     # Arrays of a file may have other lengths than those that the map names.
     rows = np.arange(1, 1 + int(first_rows[-1])) if len(parts) > 1 else first.lines[: int(first_rows[-1])]
-    units = tuple(column_map.sources[name].unit for name in names)
-    raw = RawTable(names, units, tuple(values[name] for name in names), rows, place, missing=missing, other=other)
-    return raw if keep.all() else raw.taken(np.flatnonzero(keep))
+    units = tuple("s" if source.unit == STAMP else source.unit for source in column_map.sources.values())
+    raw = RawTable(names, units, tuple(values[name] for name in names), rows, place)
+    other = int(np.sum(~keep & ~missing))
+    return raw if keep.all() else replace(raw.taken(np.flatnonzero(keep)), lost=rows[missing], other=other)
 
 
 class _Part:
@@ -438,7 +456,7 @@ class _Part:
             read = export.words if texts else export.values
             if read is None:
                 raise node.error(
-                    f"where takes numbers for a {export.path.suffix} file",
+                    f"{node.key} takes numbers for a {export.path.suffix} file",
                     "a text",
                     "write a number, or export the file as CSV",
                 )
@@ -551,8 +569,8 @@ def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.n
 
 def _kept(
     node: Node, values: Mapping[str, np.ndarray], where: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray, int, int]:
-    """Which rows are used, and how many are dropped: for a missing cell, and outside ``where``."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows are used, and which are dropped for a missing cell; the others lie outside ``where``."""
     everything = np.ones(next(iter(values.values())).size, bool)
     inside = np.all([everything, *(rows for rows, _ in where)], axis=0)
     unknown = np.any([~everything, *(rows for _, rows in where)], axis=0)
@@ -560,5 +578,4 @@ def _kept(
     keep = inside & ~empty
     if not keep.any():
         raise node.error("a table must have rows", "none is left", "correct where, or map another column")
-    missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
-    return keep, missing, keep.size - int(np.sum(keep)) - missing
+    return keep, (inside & empty) | (unknown & ~inside)

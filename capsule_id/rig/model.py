@@ -3,13 +3,14 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
 from capsule_id.parameters import Prior
-from capsule_id.views import counted
+from capsule_id.views import Finding, counted
 
 
 @dataclass(frozen=True)
@@ -132,10 +133,13 @@ class Table(Generic[S]):
     rows : (n,) 1-based line number of every row in the file, read-only; findings name rows by it. Of a table from
         files put one below the other: 1-based number of the row
     bench : its kind is a bench test; else a forced run
-    missing, other : rows of the files that a column map drops: for a missing cell, and outside ``where``
+    lost : (k,) numbers, as in ``rows``, of the rows of the files that are dropped for a missing cell
+    other : number of rows dropped, outside ``where``
     rejected : rows dropped as outliers, by the rule ``reject``
     encodings : of its texts, by file
     drift : of the clock of its times against true time, 1; the times are read with its value
+    findings : what was done to its times
+    entry : index of its ``[[experiment]]``, which may hold several records
     """
 
     kind: str
@@ -145,15 +149,22 @@ class Table(Generic[S]):
     settings: S
     rows: np.ndarray
     bench: bool = True
-    missing: int = 0
+    lost: np.ndarray = field(default_factory=partial(np.empty, 0, int))
     other: int = 0
     rejected: int = 0
     encodings: Mapping[str, str] = field(default_factory=dict)
     drift: Quantity = NO_DRIFT
+    findings: tuple[Finding, ...] = ()
+    entry: int = 0
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""
         return self.columns[name].values
+
+    @property
+    def missing(self) -> int:
+        """Number of rows dropped for a missing cell."""
+        return len(self.lost)
 
     def __repr__(self) -> str:
         columns = ", ".join(f"{column.name} [{column.unit}]" for column in self.columns.values())

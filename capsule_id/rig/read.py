@@ -1,7 +1,6 @@
 """Reads a rig folder into a ``Rig``: ``rig.toml`` by the rules of the kinds, tables in SI, rules between tables."""
 
 import hashlib
-import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -17,10 +16,9 @@ import numpy as np
 from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import Parameter, Prior
-from capsule_id.rig.filters import FEWEST_PERIODS, clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
-from capsule_id.rig.formats.text import MissingCellsError
+from capsule_id.rig.formats.text import is_stamp
 from capsule_id.rig.guess import find_layout, proposal
 from capsule_id.rig.maps import (
     MAP_KEYS,
@@ -31,8 +29,8 @@ from capsule_id.rig.maps import (
     refuse_idle_errors,
     without_stated_errors,
 )
-from capsule_id.rig.model import NO_DRIFT, ROUNDING, Column, Quantity, Rig, Settings, Table
-from capsule_id.rig.plateaus import read_plateaus, readings_of_plateaus, without_outliers
+from capsule_id.rig.model import ROUNDING, Column, Quantity, Rig, Settings, Table
+from capsule_id.rig.plateaus import Plateaus, read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
     TABLE_KEYS,
@@ -47,9 +45,10 @@ from capsule_id.rig.schema import (
     read_model,
     read_rules,
 )
+from capsule_id.rig.times import Record, records_of, remedy_of_order
 from capsule_id.rig.toml import LARGEST, NAME_PATTERN, SMALLEST, Node, is_plausible, parse_toml, remedy_for, shown
-from capsule_id.rig.units import UnitError, factor_to_si, scale
-from capsule_id.views import counted
+from capsule_id.rig.units import STAMP, UnitError, factor_to_si, scale
+from capsule_id.views import Finding
 
 # folder: ``rig.toml`` and the rules between its entries.
 
@@ -194,12 +193,12 @@ def _read_experiments(
         stop_if_interrupted()
         entry = entries[index]
         with collecting(faults):
-            table, sha256 = _read_experiment(entry.table("[[experiment]]"), kinds, ground, label)
-            if table.label in [other.label for other in tables]:
+            found, sha256 = _read_experiment(entry.table("[[experiment]]"), kinds, ground, label)
+            if same := {table.label for table in found}.intersection(other.label for other in tables):
                 raise entry[next(key for key in ("label", "file", "files") if key in entry)].error(
-                    "labels must be unique", shown(table.label), 'give one of them a label of its own: label = "..."'
+                    "labels must be unique", shown(min(same)), 'give one of them a label of its own: label = "..."'
                 )
-            tables.append(table)
+            tables += [replace(table, entry=index) for table in found]
             files |= sha256
     if not faults:
         refuse_idle_errors(root, tables)
@@ -220,8 +219,8 @@ def _default_labels(entries: Sequence[Any]) -> list[str]:
 
 def _read_experiment(
     entry: Node, kinds: Mapping[str, KindRule], ground: Mapping[str, Quantity], label: str
-) -> tuple[Table, Mapping[str, str]]:
-    """One entry with its table, and the sha256 of its files; ``label`` where the entry states none."""
+) -> tuple[list[Table], Mapping[str, str]]:
+    """One entry with its tables, one for each record, and the sha256 of its files; ``label`` where the entry states none."""
     if "kind" not in entry:
         raise entry.error("an experiment must have a kind", "none", 'add kind = "..."')
     word = entry["kind"].text()
@@ -238,20 +237,22 @@ def _read_experiment(
             raise entry.error(f"{kind.name} must have a {key}", "none", f"add {key} = ...")
     settings = kind.settings(**{**{key: value for key, value in ground.items() if key in rules}, **stated})
     label = entry["label"].name() if "label" in entry else label
-    table, raw, sha256 = read_table(entry, kind, label, settings)
-    for key in errors:
-        if key in entry and (column := key.rsplit("_", 1)[0]) not in table.columns:
-            raise entry[key].error(
-                f"{key} needs a column {column}", f"columns {' '.join(table.columns)}", "remove it", of_key=True
-            )
-    columns = {
-        key: without_stated_errors(entry, _with_reading_error(entry, column, kind), kind)
-        for key, column in table.columns.items()
-    }
-    table = replace(table, columns=MappingProxyType(columns))
-    for rule in kind.rules:
-        rule(Entry(table, entry, raw))
-    return table, sha256
+    read, sha256 = read_tables(entry, kind, label, settings)
+    tables = list[Table]()
+    for table, raw in read:
+        for key in errors:
+            if key in entry and (column := key.rsplit("_", 1)[0]) not in table.columns:
+                raise entry[key].error(
+                    f"{key} needs a column {column}", f"columns {' '.join(table.columns)}", "remove it", of_key=True
+                )
+        columns = {
+            key: without_stated_errors(entry, _with_reading_error(entry, column, kind), kind)
+            for key, column in table.columns.items()
+        }
+        tables.append(replace(table, columns=MappingProxyType(columns)))
+        for rule in kind.rules:
+            rule(Entry(tables[-1], entry, raw))
+    return tables, sha256
 
 
 def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
@@ -268,53 +269,6 @@ def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
             )
         stated.append(size)
     return replace(column, sd=stated[0], resolution=stated[1])
-
-
-# order: Finds why the times of a table do not increase, and the remedy that cures this cause.
-
-
-#: Largest share of rows with a repeated time where the clock stood still; of rounded times more are repeated.
-STANDS = 0.05
-_MOST_LINES = 20  # named in a remedy
-
-
-def remedy_of_order(raw: RawTable, index: int) -> str:
-    """The cause that keeps column ``index`` from increasing, tested on the rows, and its remedy; else what is seen."""
-    time, name, step = raw.columns[index], raw.names[index], np.diff(raw.columns[index])
-    back = 1 + np.flatnonzero(step <= 0.0)
-    few, falls = len(back) * FEWEST_PERIODS < len(time), bool(np.any(step < 0.0))
-    rising = [
-        other for other, c in zip(raw.names, raw.columns, strict=True) if other != name and np.all(np.diff(c) > 0.0)
-    ]
-    equal = np.lexsort(raw.columns)  # equal rows one behind the other, the first one first
-    copies = np.sort(equal[1:][np.all([one[equal[1:]] == one[equal[:-1]] for one in raw.columns], axis=0)])
-    order = np.argsort(time, kind="stable")
-    rough = [sum(float(np.sum(np.abs(np.diff(c[rows])))) for c in raw.columns) for rows in (order, slice(None))]
-    # A clock that stood still makes up for the lost time in one step.
-    levels, counts = np.unique(time, return_counts=True)
-    even = (time[-1] - time[0]) / (len(time) - 1)
-    made_up = np.all(np.abs(np.diff(levels) - counts[:-1] * even)[counts[:-1] > 1] < 0.5 * even)
-    where, repeated = (
-        f"line {' '.join(map(str, raw.rows[rows][:_MOST_LINES]))}{' …' if len(rows) > _MOST_LINES else ''}"
-        for rows in (back, copies)
-    )
-    files, rows = f"at {counted(len(back), 'row')} ({where}): write a file of each record", counted(len(back), "row")
-    still = "the clock stands still and then goes on; delete the rows with a repeated time:"
-    causes = (
-        (rising and not few, f"{' '.join(rising)} increases in every row and {name} does not: exchange the headers of "
-         f"{name} and {' '.join(rising)}, or their from in a column map"),
-        (len(clock_starts(time)) and np.all(step[back - 1] < 0.0), f"the clock starts anew {files}"),
-        (len(copies) and np.all(np.diff(np.delete(time, copies)) > 0.0),
-         f"delete the repeated rows: {repeated}"),
-        (not falls and len(back) <= STANDS * len(time) and made_up, f"{still} {where}"),
-        (not falls, f"the times are rounded, up to {counted(int(counts.max()), 'row')} share one: export them with more "
-         "digits"),
-        (len(levels) == len(time) and rough[0] <= rough[1],
-         f"sort the rows by {name}: in that order the readings are smoother"),
-        (few, f"the clock is set back {files}"),
-    )  # fmt: skip
-    other = f"{name} falls or stays in {rows} of {len(time)}: check which column holds the times"
-    return next((text for holds, text in causes if holds), other)
 
 
 # tables: Reads the files of one experiment: path check, bytes, hash, column map, columns in SI.
@@ -354,10 +308,13 @@ def table_path(node: Node) -> Path:
     return file
 
 
-def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> tuple[Table, RawTable, dict[str, str]]:
-    """The table of an experiment, by its column map if it has one: its columns are checked, still without reading errors.
+def read_tables(
+    entry: Node, kind: KindRule, label: str, settings: Settings
+) -> tuple[list[tuple[Table, RawTable]], dict[str, str]]:
+    """The tables of an experiment, one for each record, by its column map if it has one.
 
-    Also the table as written, without its numbers, and the sha256 of the bytes read by the names of the files.
+    Their columns are checked, still without reading errors. Also each table as written, without its numbers, and the
+    sha256 of the bytes read by the names of the files.
 
     Raises
     ------
@@ -396,18 +353,47 @@ def read_table(entry: Node, kind: KindRule, label: str, settings: Settings) -> t
         raw = apply_map(entry, list(exports.values()), column_map)
         encodings = {name: export.encoding for name, export in exports.items()}
         del exports
-    drift = NO_DRIFT
-    if (clock := clock_of(entry)) is not None:
-        raw, drift = on_reference(clock, raw)
+    stamps: tuple[Finding, ...] = ()
+    if column_map is not None and any(source.unit == STAMP for source in column_map.sources.values()):
+        stamps = (Finding("times.stamps", "ok", {"file": nodes[0].value, "rows": len(raw.rows)}),)
+    increasing = "time" in raw.names and "time" in kind.columns and plateaus is None and len(nodes) == 1
+    records = records_of(raw, nodes[0].value) if increasing else [Record(raw)]
+    labels = [label] if len(records) == 1 else [f"{label}_{k + 1}" for k in range(len(records))]
+    tables = []
+    for own, record in zip(labels, records, strict=True):
+        one, drift = record.raw, record.drift
+        if (clock := clock_of(entry)) is not None:
+            one, stated = on_reference(clock, one)
+            drift = replace(stated, sd=float(np.hypot(stated.sd, drift.sd)))
+        tables.append(_table(entry, kind, own, settings, one, plateaus, drift))
+        findings = (*stamps, *record.findings)
+        tables[-1] = (
+            replace(tables[-1][0], file=nodes[0].value, encodings=encodings, findings=findings),
+            tables[-1][1],
+        )
+        stamps = ()
+    return tables, hashes
+
+
+def _table(
+    entry: Node,
+    kind: KindRule,
+    label: str,
+    settings: Settings,
+    raw: RawTable,
+    plateaus: Plateaus | None,
+    drift: Quantity,
+) -> tuple[Table, RawTable]:
+    """One table of an experiment in SI, without outliers, and as written, without its numbers."""
     if "reject" in entry:
         raw = without_outliers(entry["reject"], raw, _times)
     if plateaus is not None:
         raw = readings_of_plateaus(entry["plateaus"], raw, _times(raw), plateaus)
     raw.rows.flags.writeable = False
     columns = {column: _to_si(raw, index, kind.columns[column]) for index, column in enumerate(raw.names)}
-    dropped = raw.missing, raw.other, raw.rejected, encodings, drift
-    table = Table(kind.name, label, nodes[0].value, columns, settings, raw.rows, kind.bench, *dropped)
-    return table, replace(raw, columns=()), hashes
+    dropped = raw.lost, raw.other, raw.rejected
+    table = Table(kind.name, label, "", columns, settings, raw.rows, kind.bench, *dropped, drift=drift)
+    return table, replace(raw, columns=())
 
 
 def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]:
@@ -423,6 +409,8 @@ def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]
     columns = {name: rule for name, rule in kind.columns.items() if name != without}
     sets = tuple(tuple(name for name in names if name != without) for names in kind.sets)
     raw = READERS[path.suffix.lower()](path.read_bytes(), path)
+    if len(raw.lost):
+        raise InputError("settings must have no missing cell", "one", "fill it", path, int(raw.lost[0]), 1)
     _check_names(raw.names, replace(kind, columns=columns, sets=sets), partial(raw.error, None))
     return {name: _to_si(raw, index, columns[name]) for index, name in enumerate(raw.names)}
 
@@ -453,14 +441,10 @@ def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTa
         raw = READERS[suffix](content, file)
         _check_names(raw.names, kind, partial(raw.error, None))
     except InputError as error:
-        lost = isinstance(error, MissingCellsError)
-        if not lost and (error.line != 1 or _A_TRIAL in error.remedy):
+        if (error.line != 1 and not is_stamp(error.value.strip("'"))) or _A_TRIAL in error.remedy:
             raise
         proposed = _proposal(file, kind, Layout())
         remedy = f"{error.remedy}; or add {proposed} to the experiment, and no other column is read"
-        if lost:
-            proposed += f" and missing = {json.dumps(error.texts, ensure_ascii=False)}"
-            remedy = f"add two lines to the experiment, which drop all rows without a reading: {proposed}"
         raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
     return raw
 

@@ -431,8 +431,8 @@ def check_masses(
         At the kind of the experiment, or at ``free``; it names the missing mass.
     """
     needs = [
-        (root["experiment"][index]["kind"], mass, f"{table.kind} needs {mass}", "")
-        for index, table in enumerate(tables)
+        (root["experiment"][table.entry]["kind"], mass, f"{table.kind} needs {mass}", "")
+        for table in tables
         for mass in kinds[table.kind].masses(table)
     ]
     needs += [
@@ -468,7 +468,7 @@ def check_normal_forces(root: Node, tables: Sequence[Table[Any]], stated: Mappin
         At the first N0 with (m1 + m2) g cos(slope) + N0 <= 0.
     """
     mass = sum(stated[name].value for name in ("m1", "m2") if name in stated)
-    for index, table in enumerate(tables):
+    for table in tables:
         settings = table.settings
         if not isinstance(settings, GroundSettings) or settings.N0 is None or "m2" not in stated:
             continue
@@ -476,5 +476,5 @@ def check_normal_forces(root: Node, tables: Sequence[Table[Any]], stated: Mappin
         N = mass * stated["g"].value * cos(slope) + settings.N0.value
         if N <= 0.0:
             rule = f"the normal force (m1 + m2) g cos(slope) + N0 of {table.label} must be positive"
-            node = node_of_ground(root["experiment"][index], "N0")
+            node = node_of_ground(root["experiment"][table.entry], "N0")
             raise node.error(rule, f"{N:.3g} N", "raise N0; N0 > 0 presses the capsule down")

@@ -26,10 +26,13 @@ _DEFINITIONS = {
     "cm": "1e-2 * m",
     "km": "1e3 * m",
     "in": "0.0254 * m",
+    "stamp": "1 * s",  # a date and a time of day, or one of them, as a column map reads it
     "ns": "1e-9 * s",
     "us": "1e-6 * s",
     "ms": "1e-3 * s",
     "min": "60 * s",
+    "h": "3600 * s",
+    "d": "86400 * s",
     "mg": "1e-6 * kg",
     "g": "1e-3 * kg",
     "lb": "0.45359237 * kg",
@@ -93,8 +96,8 @@ def _registry() -> Any:
     return registry
 
 
-#: Written for a unit that a file does not state.
-UNKNOWN = "?"
+#: Written for a unit that a file does not state, and for times of day.
+UNKNOWN, STAMP = "?", "stamp"
 #: Units of the output of a sensor.
 _SIGNALS = ("V", "mV")
 

@@ -191,8 +191,8 @@ def test_the_unit_of_a_column_without_known_name_is_kept(
 
 def test_times_that_do_not_increase_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "decay.csv"
-    for digits, named in ((2, True), (4, False)):
-        file.write_text("time [s],x_rel [mm]\n" + decay_rows(digits=digits), encoding="utf-8")
+    for first, named in (("", False), ("5.0,2.5\n", True)):
+        file.write_text("time [s],x_rel [mm]\n" + first + decay_rows(), encoding="utf-8")
         assert cli.capsule_id(["import", str(file)]) == 0
         assert ("Times must increase; 'time [s]' does not at line 3." in capsys.readouterr().out) == named
 

@@ -93,7 +93,8 @@ def test_a_fault_at_the_end_of_a_large_file_is_found() -> None:
         "1e5.5",
         "#",
         "=1+1",
-        "NA",
+        "NAN0",
+        "over",
     ],
 )
 def test_what_is_not_a_number(cell: str) -> None:

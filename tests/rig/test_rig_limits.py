@@ -171,9 +171,8 @@ def test_a_table_with_missing_cells_is_read_at_once(monkeypatch: pytest.MonkeyPa
     number_in = texts.number_in
     monkeypatch.setattr(texts, "number_in", lambda cell, mark: seen.append(cell) or number_in(cell, mark))
     row = ",".join(["1"] * 99) + ",--\n"
-    with pytest.raises(texts.MissingCellsError, match=r"^table.csv:2:199: a cell must be a number, '--'") as caught:
+    with pytest.raises(InputError, match=r"^table.csv:2:199: a cell must not be empty"):
         read_csv((",".join(f"c{i} [1]" for i in range(100)) + "\n" + row * 50).encode(), TABLE)
-    assert caught.value.texts == ("--",)
     assert len(seen) < 10  # two kinds of cells
 
 
@@ -191,13 +190,14 @@ def test_the_reader_in_c_reads_the_blocks_without_missing_cells(monkeypatch: pyt
 
 
 def test_a_remedy_names_a_few_of_many_rows(tmp_path: Path) -> None:
-    """Before: an error of 31 MB that named four million rows."""
+    """Before: an error of 31 MB that named four million rows. Rows repeated at once are dropped; these are a second copy."""
     time = np.arange(40) / 100.0
-    rows = "".join(f"{t:.2f},{x:.5f}\n" * 2 for t, x in zip(time, np.cos(30.0 * time), strict=True))
+    one = [f"{t:.2f},{x:.5f}\n" for t, x in zip(time, np.cos(30.0 * time), strict=True)]
+    rows = "".join([*one[:31], *one[10:31], *one[31:]])
     (tmp_path / "d.csv").write_text(f"time [s],x_rel [mm]\n{rows}", encoding="utf-8")
     entry = '[[experiment]]\nkind = "free_vibration"\nfile = "d.csv"\n'
     (tmp_path / "rig.toml").write_text(f'[rig]\nname = "twice"\n{entry}', encoding="utf-8")
-    with pytest.raises(InputError, match=r"delete the repeated rows: line 3( [0-9]+){19} …") as caught:
+    with pytest.raises(InputError, match=r"delete the repeated rows: line 33( [0-9]+){19} …") as caught:
         capsule_id.read_rig(tmp_path)
     assert len(str(caught.value)) < 500
 

@@ -24,7 +24,7 @@ TABLE_FAULTS = [
     ("static_friction.csv", "‸angle [degrees]\n34\n", "angle: unknown unit symbol degrees"),
     ("static_friction.csv", "angle [deg]\n34\n‸90\n", "angle must lie between 0 and 90 deg, 90 deg"),
     ("static_friction.csv", "angle [deg]\n34\n‸-1\n", "angle must lie between 0 and 90 deg"),
-    ("static_friction.csv", "angle [deg]\n34\n ‸nan\n", "a cell must be a finite number, nan"),
+    ("static_friction.csv", "angle [deg]\n34\n ‸inf\n", "a cell must be a finite number, inf"),
     ("static_friction.csv", "angle [deg]\n34\n‸-inf\n", "a cell must be a finite number"),
     ("static_friction.csv", "angle [deg]\n34\n‸1e999\n", "a cell must be a finite number, '1e999'"),
     ("static_friction.csv", "angle [deg]\n34\n‸33.x\n", "a cell must be a number"),

@@ -56,13 +56,17 @@ def concerned(finding: Finding, experiments: Sequence[Experiment]) -> frozenset[
 
 
 def with_scaled(finding: Finding, experiments: Sequence[Experiment]) -> Finding:
-    """``finding`` with the parameters that its scales multiply: those of the tables and masses that it names."""
-    scales = finding.facts.get("scales", ())
+    """``finding`` with the parameters that its scales multiply: those of the tables and masses that it names.
+
+    One that leaves its table ``unjudged`` is about all parameters of that table.
+    """
+    scales, unjudged = finding.facts.get("scales", ()), finding.facts.get("unjudged", False)
     masses, labels = {"m1", "m2"}.intersection(scales), {name.rpartition(".")[0] for name in scales} - {""}
+    labels |= {finding.experiment} if unjudged else set()
     others = {"g", "slope", "N0"}.intersection(scales)  # all friction depends on them
     read = [e for e in experiments if others or masses & {*e.masses} or labels & {e.label, e.table.label}]
     names = dict.fromkeys([*sorted(masses), *(row.name for e in read for row in e.parameters)])
-    return replace(finding, parameters=tuple(names)) if scales else finding
+    return replace(finding, parameters=tuple(names)) if scales or unjudged else finding
 
 
 def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -22,8 +22,10 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.layouts import read_text
 from capsule_id.rig.formats.raw import (
+    RATE_NAMES,
     READING,
     SPREAD,
+    UNIT_NAMES,
     Export,
     Layout,
     complete,
@@ -182,9 +184,25 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
                 continue
             readings += found.size
             refuse_large(READING * readings, content, path)
-            array, unit = _written(found), found.attrs.get("units", found.attrs.get("unit"))
-            unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
-            yield name, np.ascontiguousarray(array.T if by_columns else array), unit if isinstance(unit, str) else ""
+            array, unit = _written(found), unit_stated(found.attrs)
+            yield name, np.ascontiguousarray(array.T if by_columns else array), unit
+        objects: Any = [("", file), *((k, file[k]) for k, link in links.items() if isinstance(link, h5py.HardLink))]
+        for name, found in objects:
+            for key in (key for key in found.attrs if key.lower() in RATE_NAMES):  # a rate that an attribute states
+                value = np.asarray(found.attrs[key])
+                if value.size == 1 and value.dtype.kind in "fiu":
+                    yield f"{name}/{key}".lstrip("/"), value.reshape(1).astype(float), ""
+
+
+def unit_stated(attributes: Mapping[Any, Any]) -> str:
+    """The unit among the attributes of a column, texts or bytes by name; "" where they state none."""
+    for key in attributes:
+        name, unit = (key.decode("utf-8", "replace") if isinstance(key, bytes) else key), ""
+        if name.lower() in UNIT_NAMES:
+            unit = attributes[key].decode("utf-8", "replace") if isinstance(attributes[key], bytes) else attributes[key]
+        if isinstance(unit, str) and unit.strip():
+            return unit
+    return ""
 
 
 def _unreadable(found: Any) -> Iterator[str]:
@@ -297,8 +315,18 @@ def _columns(content: bytes, path: Path) -> Named:
             path,
         )
     refuse_large(READING * file.metadata.num_rows * len(numeric), content, path)
-    table = file.read(columns=numeric, use_threads=False)
-    yield from ((name, table.column(name).to_numpy(), "") for name in table.column_names)
+    stamps = [field.name for field in schema if pa.types.is_timestamp(field.type)]
+    table = file.read(columns=[*numeric, *stamps], use_threads=False)
+    for name in table.column_names:
+        column, unit = table.column(name).to_numpy(), unit_stated(schema.field(name).metadata or {})
+        yield (name, _seconds(column), "s") if name in stamps else (name, column, unit)
+
+
+def _seconds(stamps: np.ndarray) -> np.ndarray:
+    """Seconds since the first of these dates and times of day, (n,); NaN where one is missing."""
+    here = ~np.isnat(stamps)
+    since = (stamps - stamps[here][:1]) / np.timedelta64(1, "ns") if here.any() else np.full(len(stamps), np.nan)
+    return np.where(here, 1e-9 * since, np.nan)
 
 
 read_parquet = partial(_read_arrays, _columns, "write it again", "pyarrow")
@@ -332,14 +360,15 @@ def _channels(content: bytes, path: Path) -> Named:
             scales: Any = properties.get(_SCALES, 0)
             if not 0 <= scales <= MOST_SCALES:  # npTDMS makes a list of so many elements
                 raise ValueError(f"{scales} scales of a channel")
-        channels = [channel for channel in everything if channel.dtype.kind in "fiu"]
+        channels = [channel for channel in everything if channel.dtype.kind in "fiuM"]
         refuse_large(READING * sum(len(channel) for channel in channels), content, path)
         names = [channel.name for channel in channels]
         for channel in channels:
             name = channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}"
             if (clock := _clock(channel)) is not None:
                 clocks[name] = (*clock, len(channel))
-            yield name, np.asarray(channel[:]), str(channel.properties.get("unit_string", ""))
+            values, unit = np.asarray(channel[:]), unit_stated(channel.properties)
+            yield (name, _seconds(values), "s") if values.dtype.kind == "M" else (name, values, unit)
     common = len(set(clocks.values())) == 1
     for name, (offset, increment, samples) in clocks.items():
         yield TIME if common else f"{TIME}({name})", offset + increment * np.arange(samples), "s"

@@ -30,6 +30,7 @@ from capsule_id.rig.formats.text import (
     cells_of,
     is_comment,
     is_row,
+    is_stamp,
     number_in,
     place_of_cell,
     read_column,
@@ -264,8 +265,8 @@ def is_number(cell: str) -> bool:
 
 
 def _is_reading(cell: str, layout: Layout) -> bool:
-    """Whether a cell is a number or a stated missing marker."""
-    return is_number(cell) or cell in layout.missing
+    """Whether a cell is a number, a time stamp, or a stated missing marker."""
+    return is_number(cell) or cell in layout.missing or is_stamp(cell)
 
 
 # lvm: Reads LabVIEW measurement files (``.lvm``): a header of the file, then segments with a header and rows of
@@ -321,7 +322,11 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
         clocks = {-k: [_clock(segment, k, decimal, path) for segment in segments] for k in sources[1:]}
         alike = all(clock == clocks[-1] for clock in clocks.values())
         sources = [-1, *sources[1:]] if alike else [source for k in sources[1:] for source in (-k, k)]
-    headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
+    headers = [tuple(_TIMES if source < 0 else names[source] for source in sources)]
+    # A label a channel; the names of the channels stand behind their times.
+    labels, channels = segments[0].keys.get("Y_Unit_Label", []), [name for name in names if name != _TIMES]
+    units = dict(zip(channels, labels, strict=False)) if len({*channels}) == len(channels) else {}
+    headers += [tuple(units.get(name, "") for name in headers[0])] if any(units.values()) else []
     stored = _by_cells(text, segments, separator, decimal, layout.missing)
     lines = np.concatenate([np.arange(segment.first, segment.stop) for segment in segments]) + 1
 
@@ -335,7 +340,7 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
         line = text.line(number := int(lines[0] - 2 if row is None else lines[row] - 1))
         return path, number + 1, place_of_cell(line, separator, max(sources[column], 0), len(line) + 1)
 
-    return Export(path, (headers,), len(sources), lines, values, place, text.encoding)
+    return Export(path, tuple(headers), len(sources), lines, values, place, text.encoding)
 
 
 def _clock(segment: _Segment, channel: int, decimal: str | None, path: Path) -> tuple[float, float]:

@@ -7,7 +7,8 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -246,6 +247,21 @@ def place_of_byte(before: bytes, codec: str = "utf-8") -> tuple[int, int]:
 # raw: A table as written: numbers in the units of the file, and the place of each cell.
 
 
+#: Texts of cells without a reading.
+NO_READING = tuple(
+    dict.fromkeys(
+        text
+        for word in ("", "-", "--", "---", "NaN", "NA", "N/A", "#N/A", "null", "none")
+        for text in (
+            word,
+            word.lower(),
+            word.upper(),
+            word.capitalize(),
+            *([f"-{word}", f"-{word.lower()}"] * (word == "NaN")),
+        )
+    )
+)
+
 Place = tuple[Path, int, int]  #: file, and 1-based line and column, of a cell
 
 
@@ -260,7 +276,8 @@ class RawTable:
     rows : (rows,) 1-based line number of every row; of files put one below the other the number of the row
     place : (row index or None for the header, column index) -> where the cell stands
     encoding : of the text, or "UTF-8"
-    missing, other, rejected : rows left out: for a missing cell, outside ``where``, as outliers
+    lost : (k,) those of the rows left out for a missing cell
+    other, rejected : number of rows left out: outside ``where``, as outliers
     """
 
     names: tuple[str, ...]
@@ -269,7 +286,7 @@ class RawTable:
     rows: np.ndarray
     place: Callable[[int | None, int], Place]
     encoding: str = "UTF-8"
-    missing: int = 0
+    lost: np.ndarray = field(default_factory=partial(np.empty, 0, int))
     other: int = 0
     rejected: int = 0
 
@@ -297,7 +314,7 @@ class Layout:
     ----------
     data_from_line, data_to_line : 1-based lines of the first and the last row of numbers (None: the first line that holds
         a number, and the last line of the file)
-    missing : texts of cells without a reading, such as ``--`` or ``NaN``
+    missing : texts of cells without a reading, such as ``--`` or ``NaN``; a column map adds ``NO_READING``
     decimal : decimal mark of a text table, "." or "," (None: found in the file)
     columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
     words : headers, or numbers counted from 1, of those whose texts it keeps too
@@ -341,6 +358,10 @@ class Export:
 # arrays: Makes an export of named arrays: the form of every format without lines.
 
 
+#: Names, in small letters, of a number that is the sampling rate, Hz, or its inverse, s; of an attribute, those of a unit.
+RATE_NAMES = ("fs", "rate", "sampling_rate", "sample_rate", "samplerate", "samplingrate", "sampling_frequency")
+STEP_NAMES = ("dt", "ts", "sample_time", "sampling_interval", "sample_interval")
+UNIT_NAMES = ("unit", "units", "unit_string", "ni_unitdescription")
 #: A matrix this many times as wide as high holds its channels in rows.
 WIDE = 10
 

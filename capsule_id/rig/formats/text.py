@@ -8,14 +8,15 @@ import sys
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import date
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Place, RawTable, TextFile, lines_of, refuse_wide
+from capsule_id.rig.formats.raw import NO_READING, Place, RawTable, TextFile, lines_of, refuse_wide
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -69,7 +70,7 @@ def number_in(cell: str, decimal: str) -> float | None:
     return None if _NUMBER.fullmatch(written) is None else float(written)
 
 
-def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> float:
+def read_number(cell: str, path: Path, line: int, column: int, decimal: str = ".") -> float:
     """One cell as a finite number.
 
     Raises
@@ -78,10 +79,11 @@ def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> 
         At ``line`` and ``column`` if it is no number.
     """
     if not cell:
-        raise InputError("a cell must not be empty", "nothing", "write a number or delete the row", path, line, column)
+        remedy = "write a number; a table must have a row without missing cells"
+        raise InputError("a cell must not be empty", "nothing", remedy, path, line, column)
     value = number_in(cell, decimal)
     if value is None:
-        if cell.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        if cell.lower().lstrip("+-") in ("inf", "infinity"):
             raise InputError("a cell must be a finite number", cell, "delete the row", path, line, column)
         raise InputError(
             "a cell must be a number",
@@ -150,7 +152,7 @@ def read_column(
                 f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row",
                 *place(k),
             )
-        values[k] = read_number(text, mark, *place(k)) if is_beyond_floats(value, text) else value
+        values[k] = read_number(text, *place(k), mark) if is_beyond_floats(value, text) else value
     return values
 
 
@@ -158,6 +160,85 @@ def shown_cell(cell: str) -> str:
     """A faulty cell for an error line: printable and short."""
     text = repr(cell)
     return text if len(text) <= _LONGEST_QUOTED else text[:_LONGEST_QUOTED] + "…"
+
+
+# stamps: Dates and times of day as seconds since the first one.
+
+
+#: A date, which may be left out, and a time of day or of an hour: 2024-03-01T12:34:56.789+01:00, 12:34:56,789, 34:56.8.
+_STAMP = re.compile(
+    r"(?:(?:(?P<year>\d{4})[-/.](?P<month>\d\d?)[-/.](?P<day>\d\d?)|(?P<one>\d\d?)(?P<mark>[-/.])(?P<two>\d\d?)[-/.](?P<last>\d{4}|\d\d))"
+    r"(?:T|,? +))?(?P<h>\d{1,3}):(?P<min>\d\d)(?::(?P<s>\d\d)(?:[.,:](?P<part>\d{1,9}))?|[.,](?P<tail>\d{1,9}))"
+    r"(?: ?(?P<half>[AaPp])\.?[Mm]\.?)?(?: ?(?:Z|UTC|GMT|(?P<zone>[+-]\d\d):?(?P<zone_min>\d\d)))?"
+)
+_SECOND, _HOUR = 10**9, 3600 * 10**9  # ns
+
+
+def is_stamp(cell: str) -> bool:
+    """Whether a cell is a time stamp."""
+    return ":" in cell and _STAMP.fullmatch(cell) is not None
+
+
+def seconds_of_stamps(texts: Sequence[str], missing: Sequence[str], place: Callable[[int], Place]) -> np.ndarray:
+    """Seconds since the first of these stamps, (n,); NaN at a missing one. Without a date, a fall is the next day, or hour.
+
+    Raises
+    ------
+    InputError
+        At the first text that is no stamp, or where the dates are none.
+    """
+    found = [_STAMP.fullmatch(text) for text in texts]
+    wrong = next(
+        (k for k, (text, one) in enumerate(zip(texts, found, strict=True)) if not one and text not in missing), None
+    )
+    known = [k for k, one in enumerate(found) if one]
+    if wrong is not None or not known:
+        wrong = wrong or 0
+        remedy = "correct the cell, or state the unit of the numbers, such as s"
+        rule = "a time stamp must be a time of day, such as 12:34:56.789, with or without a date"
+        raise InputError(rule, shown_cell(texts[wrong]), remedy, *place(wrong))
+    stamps = [one for one in found if one]
+    clocks = np.array([_clock(one) for one in stamps])
+    days = list[np.ndarray]()
+    for first in ("one", "two"):
+        with suppress(ValueError):
+            days.append(np.array([_day(one, first) for one in stamps]))
+    if not days:
+        raise InputError(
+            "the date of a time stamp must exist", shown_cell(texts[known[0]]), "correct it", *place(known[0])
+        )
+    turn = 24 * _HOUR if stamps[0]["tail"] is None else _HOUR
+    day = min(days, key=np.ptp)  # 03/04/2024: the order of day and month that makes the record shorter
+    if not day.any():
+        day = np.cumsum(np.diff(clocks, prepend=clocks[0]) < -turn // 2)
+    total = day * turn + clocks
+    values = np.full(len(texts), np.nan)
+    values[known] = (total - total[0]) / _SECOND
+    return values
+
+
+def _clock(stamp: re.Match[str]) -> int:
+    """The time of day of a stamp in Greenwich, ns; without seconds that of an hour."""
+    units = [int(stamp["h"]), int(stamp["min"]), int(stamp["s"] or 0)]
+    if stamp["half"]:
+        units[0] = units[0] % 12 + 12 * (stamp["half"] in "Pp")
+    units = units if stamp["tail"] is None else [0, *units[:2]]
+    if stamp["zone"]:
+        sign = -1 if stamp["zone"][0] == "-" else 1
+        units = [units[0] - int(stamp["zone"]), units[1] - sign * int(stamp["zone_min"]), units[2]]
+    seconds = (units[0] * 60 + units[1]) * 60 + units[2]
+    return seconds * _SECOND + int((stamp["part"] or stamp["tail"] or "").ljust(9, "0"))
+
+
+def _day(stamp: re.Match[str], first: str) -> int:
+    """The number of the day of a stamp, 0 without a date; ``first``: which of two numbers is the day, if no point follows."""
+    if stamp["year"]:
+        return date(int(stamp["year"]), int(stamp["month"]), int(stamp["day"])).toordinal()
+    if not stamp["one"]:
+        return 0
+    day, month = ("one", "two") if first == "one" or stamp["mark"] == "." else ("two", "one")
+    year = int(stamp["last"])
+    return date(year + 2000 * (year < 100), int(stamp[month]), int(stamp[day])).toordinal()
 
 
 # rows: Reads rows of numbers from a text in blocks: quickly where all cells are numbers, else cell by cell.
@@ -356,21 +437,11 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
 # 1-based: the line of the file, and the character of that line at which the cell begins.
 
 
-#: What exports write where there is no reading, in small letters, without signs.
-_NO_READING = ("", "nan", "inf", "infinity", "na", "n/a", "#n/a", "null", "none")
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 
 
-class MissingCellsError(InputError):
-    """Cells without a reading: the error of the first one, with the ``texts`` of all."""
-
-    def __init__(self, first: InputError, texts: tuple[str, ...]) -> None:
-        super().__init__(first.rule, first.value, first.remedy, first.file, first.line, first.column)
-        self.texts = texts
-
-
 def read_csv(content: bytes, path: Path) -> RawTable:
-    """Read a CSV table.
+    """Read a CSV table; rows with a missing cell (``NO_READING``) are left out.
 
     Parameters
     ----------
@@ -413,7 +484,11 @@ def read_csv(content: bytes, path: Path) -> RawTable:
         line = 0 if row is None else row + 1
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    return RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
+    raw = RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
+    missing = np.any(np.isnan(columns), axis=0)
+    if missing.all():  # the first cell of the first row that holds none
+        read_number("", *raw.place(0, int(np.argmax([np.isnan(column[0]) for column in columns]))))
+    return replace(raw.taken(np.flatnonzero(~missing)), lost=raw.rows[missing]) if missing.any() else raw
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -436,9 +511,8 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
 
 
 def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
-    """The columns, read cell by cell; raises at the first fault, and at missing readings where there is no other."""
+    """The columns, read cell by cell, with NaN at missing ones; raises at the first fault."""
     path, columns, mark, blank = file.path, shape.width, shape.decimal or ".", None
-    missing: dict[str, InputError] = {}
     values = array("d")
 
     @lru_cache(1 << 16)  # short cells are many, but many of them are the same
@@ -478,16 +552,8 @@ def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
             )
         row = [*map(number, cells)]
         values.extend(row)
-        for column in (k for k, one in enumerate(row) if math.isnan(one) and cells[k] not in missing):
-            cell, place = cells[column], place_of_cell(text, shape.delimiter, column)
-            try:
-                read_number(cell, mark, path, line, place)
-            except InputError as error:
-                if cell.lower().strip("+-") not in _NO_READING:
-                    raise
-                missing[cell] = error
-    if missing:
-        raise MissingCellsError(next(iter(missing.values())), tuple(missing))
+        for column in (k for k, one in enumerate(row) if math.isnan(one) and bare(cells[k]) not in NO_READING):
+            read_number(cells[column], path, line, place_of_cell(text, shape.delimiter, column), mark)
     if not values:
         raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
     return tuple(np.array(values).reshape(-1, columns).T.copy())

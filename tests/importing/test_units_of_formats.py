@@ -1,0 +1,102 @@
+"""Units, rates and times that binary formats state beside their numbers; columns that an entry does not use."""
+
+import io
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pytest
+from nptdms import ChannelObject, TdmsWriter
+from pyarrow import parquet
+from scipy.io import savemat
+
+from capsule_id.importing import propose_entry
+from tests.rig.formats.writers import lvm
+
+TIME = np.arange(1500) * 1e-3
+DISP = 2.0 * np.exp(-3.0 * TIME) * np.cos(2 * np.pi * 12.0 * TIME) + 2e-3 * np.random.default_rng(3).standard_normal(
+    1500
+)
+
+
+def entry_of(folder: Path, name: str, content: bytes) -> str:
+    (folder / name).write_bytes(content)
+    return propose_entry(folder / name)
+
+
+@pytest.mark.parametrize("times", ["No", "One", "Multi"])
+def test_the_label_of_a_labview_channel(tmp_path: Path, times: str) -> None:
+    """Before: the label was not read, and the unit not stated."""
+    text = lvm({"t": TIME, "Disp": DISP}, times).decode()
+    text = text.replace("X_Dimension\t", "Y_Unit_Label\tMillimeters\t\nX_Dimension\t")
+    assert 'x_rel = { from = "Disp", unit = "mm" }  # sure' in entry_of(tmp_path, "a.lvm", text.encode())
+    assert 'unit = "?"' in entry_of(tmp_path, "a.lvm", text.replace("Millimeters", "").encode())
+
+
+@pytest.mark.parametrize("key", ["unit_string", "NI_UnitDescription", "Unit"])
+def test_properties_of_tdms(tmp_path: Path, key: str) -> None:
+    properties = {key: "mm", "wf_increment": 1e-3, "wf_start_offset": 0.0}
+    with TdmsWriter(tmp_path / "w.tdms") as writer:
+        writer.write_segment([ChannelObject("rig", "Disp", DISP, properties)])
+    entry = propose_entry(tmp_path / "w.tdms")
+    assert 'x_rel = { from = "Disp", unit = "mm" }  # sure' in entry
+
+
+def test_stamps_of_tdms_and_parquet(tmp_path: Path) -> None:
+    stamps = np.datetime64("2024-02-29T23:59:59.5", "us") + (1e6 * TIME).astype("timedelta64[us]")
+    with TdmsWriter(tmp_path / "a.tdms") as writer:
+        writer.write_segment([ChannelObject("rig", "Time", stamps), ChannelObject("rig", "x (mm)", DISP)])
+    parquet.write_table(pa.table({"Time": pa.array(stamps), "x (mm)": DISP}), tmp_path / "a.parquet")
+    for name in ("a.tdms", "a.parquet"):
+        entry = propose_entry(tmp_path / name)
+        assert 'time = { from = "Time", unit = "s" }  # sure' in entry
+        assert 'x_rel = { from = "x (mm)", unit = "mm" }  # sure' in entry
+
+
+def test_metadata_of_parquet(tmp_path: Path) -> None:
+    fields = [
+        pa.field("t", pa.float64(), metadata={"unit": "ms"}),
+        pa.field("x", pa.float64(), metadata={"units": "um"}),
+    ]
+    table = pa.table([pa.array(1e3 * TIME), pa.array(1e3 * DISP)], schema=pa.schema(fields))
+    parquet.write_table(table, tmp_path / "a.parquet")
+    entry = propose_entry(tmp_path / "a.parquet")
+    assert 'time = { from = "t", unit = "ms" }  # sure' in entry
+    assert 'x_rel = { from = "x", unit = "um" }  # sure' in entry
+
+
+@pytest.mark.parametrize("where", ["file", "group", "data set"])
+def test_attributes_of_hdf5(tmp_path: Path, where: str) -> None:
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        group = file.create_group("run")
+        data = group.create_dataset("disp", data=DISP)
+        data.attrs["Units"] = np.bytes_("mm")
+        {"file": file, "group": group, "data set": data}[where].attrs["sampling_rate"] = 1000.0
+    entry = entry_of(tmp_path, "a.h5", content.getvalue())
+    assert 'unit = "mm" }  # sure' in entry
+    assert 'time = { rate = { value = 1000, unit = "Hz" } }  # likely' in entry
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("fs", 1000.0), ("Fs", 1000.0), ("sample_rate", 1000.0), ("dt", 1e-3), ("Ts", 1e-3)]
+)
+@pytest.mark.parametrize("struct", [False, True])
+def test_a_rate_or_a_step_of_matlab(tmp_path: Path, name: str, value: float, struct: bool) -> None:
+    content, data = io.BytesIO(), {"disp": DISP, name: value}
+    savemat(content, {"run": data} if struct else data)
+    entry = entry_of(tmp_path, "a.mat", content.getvalue())
+    assert 'time = { rate = { value = 1000, unit = "Hz" } }  # likely' in entry
+    assert 'unit = "?"' in entry  # of the displacement, which MATLAB does not state
+
+
+def test_columns_that_are_not_used_are_named(tmp_path: Path) -> None:
+    """Before: `Load (kg)` was dropped without a word."""
+    push = "speed (m/s),distance (mm),Load (kg),Note\n0.1,1.2,5,a\n0.2,4.6,5,b\n0.3,10.1,5,c\n0.4,18,5,d\n"
+    entry = entry_of(tmp_path, "push.csv", push.encode())
+    assert "#: Not used: 'Load (kg)', 'Note'." in entry
+    assert "normal_force" not in entry
+    pull = "Pull force (N),Load (kg)\n3.1,0.5\n6.2,1.0\n9.0,1.5\n12.4,2.0\n"
+    entry = entry_of(tmp_path, "pull.csv", pull.encode())
+    assert 'add to the columns: normal_force = { from = "Load (kg)", unit = "kgf" }' in entry
