@@ -137,7 +137,7 @@ def test_a_frequency_in_hertz_is_the_same_drive() -> None:
 
     value, rate = jax.jvp(jax.jit(end), (5.5,), (1.0,))
     assert value == pytest.approx(float(both[1, -1]), rel=1e-9)
-    assert rate == pytest.approx((end(5.5 + 1e-4) - end(5.5 - 1e-4)) / 2e-4, rel=1e-4)
+    assert rate == pytest.approx(float(end(5.5 + 1e-4) - end(5.5 - 1e-4)) / 2e-4, rel=1e-4)
     assert replace(Excitation(4.0, f=5.5), P_d=3.0) == Excitation(3.0, 2.0 * np.pi * 5.5)
 
 
