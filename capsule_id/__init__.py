@@ -14,7 +14,7 @@ The pipeline; each stage makes a frozen value for the next one:
     rig = capsule_id.read_rig("data/")
     result = capsule_id.fit(rig, seed=0)
     result.write("results/twin")                             # capsule_id.load("results/twin") gives it back
-    result.trust, result.summary, result.plot_corner()
+    result["k1"].value, result["k1"].sd, result["k1"].trust, result.verdict, result.plot_corner()
 
 Glossary:
 
@@ -49,7 +49,14 @@ from typing import TYPE_CHECKING, Any
 # ruff: noqa: I001  (an import a module)
 if TYPE_CHECKING:
     __version__: str
-    from capsule_id.api import Fit as Fit, compare as compare, fit as fit, load as load, read_rig as read_rig
+    from capsule_id.api import (
+        Fit as Fit,
+        ParameterValue as ParameterValue,
+        compare as compare,
+        fit as fit,
+        load as load,
+        read_rig as read_rig,
+    )
     from capsule_id.errors import InputError as InputError
     from capsule_id.importing import propose_entry as propose_entry
     from capsule_id.inference.compare import compare_models as compare_models, compare_points as compare_points
@@ -79,7 +86,7 @@ if TYPE_CHECKING:
 
 #: The same names by module, where they are imported at their first use.
 _PUBLIC = {
-    "api": ("Fit", "compare", "fit", "load", "read_rig"),
+    "api": ("Fit", "ParameterValue", "compare", "fit", "load", "read_rig"),
     "errors": ("InputError",),
     "importing": ("propose_entry",),
     "inference.compare": ("compare_models", "compare_points"),

@@ -1,9 +1,10 @@
 """What the commands do, as functions, and the finished fit that they return."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import MISSING, dataclass, fields
+from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -13,7 +14,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from capsule_id.console import OnProgress, Progress
 from capsule_id.errors import InputError
@@ -35,12 +35,13 @@ from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
-from capsule_id.parameters import by_index, is_stated
+from capsule_id.parameters import by_index, is_stated, symbol_of
 from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
 from capsule_id.physics.model import CapsuleParameters, Drive, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.precision import prepare_xla
 from capsule_id.report.columns import (
+    differences,
     errors_left_out,
     sampled_parameters,
     table_rows,
@@ -55,26 +56,100 @@ from capsule_id.report.messages import caption_of, finding_text, messages_of, ti
 from capsule_id.report.write import data_tree, load_fields, result_files, table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
-from capsule_id.views import Finding, Level, ResultTable
+from capsule_id.views import Finding, Level, ResultTable, Trust, after_number
 
 # fitted: A finished fit as an object: words, tables, plots, simulations, files. ``fit`` and ``load`` return it.
 
 
 #: Largest number of parameters in ``repr``.
 SHOWN_PARAMETERS = 4
-#: Probability that ``compare`` calls any parameter of two equal rigs different.
-FALSE_ALARMS = 0.05
 
 Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class ParameterValue:
+    """A parameter of a fit: the numbers to quote, SI, as parameters.json has them; what is missing is NaN.
+
+    Attributes
+    ----------
+    name, unit : such as ``k2[soft]`` and ``N/m``
+    value, sd : median and sd of the sample; without a sample the maximum and its standard error
+    lower, upper : ends of the 95 % interval; NaN without a sample
+    trust : "trusted", "not trusted" or "not judged"
+    quoted : value and sd as the printed tables have them, or value and interval of a skewed posterior
+    """
+
+    name: str
+    unit: str
+    value: float
+    sd: float
+    lower: float
+    upper: float
+    trust: Trust
+    quoted: str
+
+    def __str__(self) -> str:
+        return f"{self.name} = {self.quoted}, {self.trust}"
 
 
 @dataclass(frozen=True, repr=False)
 class Fit(Result):
     """A ``Result`` in words, tables, plots and files.
 
-    ``trust`` is the word of the whole result; ``summary`` holds value, sd and trust of every parameter. The methods
-    ``plot_*`` draw into ``ax``, or into a new pyplot figure, and return the axes.
+    ``result["k1"]`` has ``value``, ``sd`` and ``trust``; ``trust`` is the word of the whole result; ``summary`` holds
+    all columns of every parameter. The methods ``plot_*`` draw into ``ax``, or into a new pyplot figure, and return
+    the axes.
     """
+
+    @property
+    def parameters(self) -> Mapping[str, ParameterValue]:
+        """The physical parameters by name, in the order of ``summary``."""
+        numbers = ("value", "sd", "lower", "upper")
+        return {
+            row.name: ParameterValue(
+                name=row.name,
+                unit=str(row.values["unit"]),
+                trust=row.values["trust"],
+                quoted=row.quoted + after_number(row.unit),
+                **{number: float(row.values[number]) for number in numbers},
+            )
+            for row in table_rows(self.summary)
+        }
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        """The parameter ``name``, such as ``result["k1"]`` or ``result["k2[soft]"]``.
+
+        Raises
+        ------
+        InputError
+            If the fit has no such parameter; the error lists names near it.
+        """
+        known = self.parameters
+        if name in known:
+            return known[name]
+        raise _unknown("parameter", name, known, [one for one in known if symbol_of(one) == symbol_of(str(name))])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.parameters
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.parameters)
+
+    def table(self, code: str) -> pd.DataFrame:
+        """The table ``code`` of the report, such as ``runs.precision``; ``notes`` holds all of them.
+
+        Tables of one code, as of several records, stand one below the other.
+
+        Raises
+        ------
+        InputError
+            If the fit has no such table; the error lists codes near it.
+        """
+        frames = [note.frame for note in self.notes if note.code == code]
+        if not frames:
+            raise _unknown("table", code, dict.fromkeys(note.code for note in self.notes))
+        return frames[0].copy() if len(frames) == 1 else pd.concat(frames)
 
     @property
     def failed(self) -> list[str]:
@@ -111,13 +186,13 @@ class Fit(Result):
         return f"<Fit of {self.rig.name}{synthetic}: {self.trust}; {', '.join(shown[:SHOWN_PARAMETERS])}{more}>"
 
     @property
-    def table(self) -> str:
+    def parameter_table(self) -> str:
         """The parameter table as the console shows it, with the remarks and what no sd contains under it."""
         under = wrapped([*self.remarks, *errors_left_out(self.summary)])
         return "\n".join([table_text(self.summary, synthetic=self.rig.synthetic), *under])
 
     def __str__(self) -> str:
-        return f"{self.table}\n{self.verdict}"
+        return f"{self.parameter_table}\n{self.verdict}"
 
     def _repr_html_(self) -> str:
         return summary_html(self, self.verdict, [*self.remarks, *errors_left_out(self.summary)])
@@ -277,18 +352,13 @@ def compare(a: Result, b: Result) -> pd.DataFrame:
                 f"{type(one).__name__} {str(one)[:60]!r}",
                 "give results of fit, or load(DIR)",
             )
-    names = [name for name in a.summary.index if name in b.summary.index]
-    one, other = a.summary.loc[names], b.summary.loc[names]
-    frame = pd.DataFrame({"unit": one["unit"]}, index=pd.Index(names, name="name"))
-    for word, part in (("a", one), ("b", other)):
-        frame[f"value_{word}"], frame[f"sd_{word}"] = part["value"].astype(float), part["sd"].astype(float)
-    frame["difference"] = frame["value_b"] - frame["value_a"]
-    frame["sd"] = np.hypot(frame["sd_a"], frame["sd_b"])
-    # Two exact constants have no sd: equal ones are 0 sd apart, others infinitely many.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        frame["sds"] = np.where(frame["difference"] == 0.0, 0.0, frame["difference"] / frame["sd"])
-    frame["differs"] = frame["sds"].abs() > stats.norm.isf(FALSE_ALARMS / 2.0 / max(len(names), 1))
-    return frame
+    return differences(a.summary, b.summary)
+
+
+def _unknown(what: str, word: str, known: Collection[str], near: Sequence[str] = ()) -> InputError:
+    """The error of a ``word`` that the result does not know: it lists ``near`` words, else similar ones, else all."""
+    close = near or get_close_matches(str(word), known, n=5) or known
+    return InputError(f"the result must have this {what}", repr(word), f"choose from {', '.join(close) or 'none'}")
 
 
 def _named(items: Sequence[Item], label: str | None, attribute: str = "label") -> Item:

@@ -1,8 +1,10 @@
 """Entry points of the two commands ``fit-params`` and ``capsule-id``: parse, call, exit code."""
 
 import argparse
+import re
 import warnings
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -18,9 +20,12 @@ BAD_INPUT, INTERNAL = 2, 1
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports wrong usage in one line on standard error, with exit code 2."""
+    """Reports wrong usage in one line on standard error, with exit code 2; a mistyped word with the one that it resembles."""
 
     def error(self, message: str) -> NoReturn:
+        if mistyped := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)$", message):
+            near = get_close_matches(mistyped[1], re.findall(r"[\w-]+", mistyped[2]), n=1)
+            message += f"; did you mean {near[0]}?" if near else ""
         console.complain(" ".join(f"{self.prog}: {message}; see {self.prog} --help".split()))
         raise SystemExit(BAD_INPUT)
 
@@ -50,30 +55,59 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
         "writes report.html. capsule-id init makes such a folder, capsule-id check examines it. Exit code 3: a check failed."
     )
     parser = _parser(program, text)
+    parser.epilog = "example: %(prog)s my-rig --seed 1"
     add_options(parser, fit.OPTIONS)
-    parser.set_defaults(run=fit.run)
+    parser.set_defaults(run=fit.run, program=program)
     return parser
 
 
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
-    from capsule_id.commands import bifurcate, check, import_file, init, predict, report, simulate, synthesize
+    from capsule_id.commands import bifurcate, check, fit, import_file, init, predict, report, simulate, synthesize
 
-    parser = _parser(program, "Make, check, simulate and report; fit-params fits.")
+    parser = _parser(program, "Make, check, fit, simulate and report.")
+    parser.epilog = "example: %(prog)s check my-rig; each COMMAND has its own --help"
     parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)
     commands = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
-    for name, module, text in (
-        ("init", init, "a rig folder with a commented rig.toml, or one that reads given exports"),
-        ("import", import_file, "describe an export and propose the entry that reads it"),
-        ("check", check, "check a rig folder and list problems before a fit"),
-        ("synthesize", synthesize, "a rig folder with known truth"),
-        ("simulate", simulate, "the capsule model: time histories and phase plane"),
-        ("bifurcate", bifurcate, "the settled motions over one quantity or two: bifurcation diagrams and maps"),
-        ("predict", predict, "displacements of a capsule robot at new settings, from a result"),
-        ("report", report, "the parameter table and findings of a result"),
+    for name, module, text, example in (
+        (
+            "init",
+            init,
+            "a rig folder with a commented rig.toml, or one that reads given exports",
+            "my-rig --from decay.csv",
+        ),
+        ("import", import_file, "describe an export and propose the entry that reads it", "decay.csv"),
+        ("check", check, "check a rig folder and list problems before a fit", "my-rig --figures figures"),
+        ("fit", fit, "fit a rig folder, as fit-params does", "my-rig --seed 1"),
+        ("synthesize", synthesize, "a rig folder with known truth", "twin --seed 1 --set k1=1500"),
+        (
+            "simulate",
+            simulate,
+            "the capsule model: time histories and phase plane",
+            "--k2 18960 --G 0.001 --P_d 4 --Omega 34.56 --out motion.csv",
+        ),
+        (
+            "bifurcate",
+            bifurcate,
+            "the settled motions over one quantity or two: bifurcation diagrams and maps",
+            "--over k2 --from 1 --to 55 --unit kN/m",
+        ),
+        (
+            "predict",
+            predict,
+            "displacements of a capsule robot at new settings, from a result",
+            "results/robot settings.csv --out predicted.csv",
+        ),
+        (
+            "report",
+            report,
+            "the parameter table and findings of a result, or several side by side",
+            "results/rig-a results/rig-b",
+        ),
     ):
         sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+        sub.epilog = f"example: %(prog)s {example}"
         add_options(sub, module.OPTIONS)
-        sub.set_defaults(run=module.run)
+        sub.set_defaults(run=module.run, program=sub.prog)
     return parser
 
 

@@ -4,6 +4,7 @@ import errno
 import io
 import logging
 import os
+import re
 import shutil
 import signal
 import socket
@@ -149,6 +150,9 @@ def _watch(receiver: socket.socket, ended: threading.Event, message: str) -> Non
 OnProgress = Callable[[int, int, str], None]
 #: Seconds between two updates of the progress, on a terminal and in a file.
 TERMINAL_INTERVAL, FILE_INTERVAL = 0.1, 10.0
+#: Colours of terminals: green, yellow, red. The words are those of ``views.Level`` and ``views.Trust``.
+_COLOURS = {"ok": 32, "trusted": 32, "warn": 33, "not judged": 33, "fail": 31, "not trusted": 31}
+_COLOURED = re.compile(r"^(?:ok|warn|fail)(?=[ :])|\b(?:not trusted|not judged|trusted)\b", re.MULTILINE)
 #: Longest message of an exception in an error line, characters.
 LONGEST_MESSAGE = 300
 #: Width of the bar in a notebook, characters.
@@ -174,10 +178,16 @@ def prepare() -> None:
                 import_module("matplotlib")
 
 
-def say(text: str) -> None:
-    """Print to standard output and flush; a closed pipe (``| head``) is no error."""
+def say(text: str, coloured: bool = False) -> None:
+    """Print to standard output and flush; a closed pipe (``| head``) is no error.
+
+    coloured : words of trust, and levels at the begin of a line, have a colour on a terminal, unless NO_COLOR is set
+    """
+    text = printable(text)
+    if coloured and sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb":
+        text = _COLOURED.sub(lambda word: f"\x1b[{_COLOURS[word[0]]}m{word[0]}\x1b[0m", text)
     try:
-        print(printable(text), flush=True)
+        print(text, flush=True)
     except OSError as error:
         _discard(error)
 

@@ -35,18 +35,25 @@ def after_number(unit: str) -> str:
     return "" if unit == "1" else f" {unit}"
 
 
+def with_unit(name: str, unit: str) -> str:
+    """The label of an axis: ``x_rel, mm``; the name alone for a number without unit."""
+    return name if unit == "1" else f"{name}, {unit}"
+
+
 def stated_p(p: float) -> str:
     """``p = 0.01``, or ``p < 1e-10`` for a smaller one: so far out, no distribution is known."""
     return f"p = {p:.2g}" if p >= SMALLEST_P else f"p < {SMALLEST_P:g}"
 
 
 class _Texts(Formatter):
-    """Fills in facts; the format ``# noun`` writes a count, the format ``p`` a probability."""
+    """Fills in facts; the format ``# noun`` writes a count, the format ``p`` a probability; a space stands before %."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         """The text of one fact."""
         if format_spec.startswith("# "):
             return counted(value, format_spec[2:])
+        if format_spec.endswith("%"):
+            return f"{format(value, format_spec)[:-1]} %"
         return stated_p(value) if format_spec == "p" else format(value, format_spec)
 
 

@@ -1,5 +1,6 @@
 """Runs commands as a user does, in a separate process or in this one."""
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from typing import Any
 import xarray as xr
 
 import capsule_id
+from capsule_id import cli
 
 ROOT = Path(capsule_id.__file__).resolve().parents[1]
 DATA = ROOT / "data"
@@ -49,6 +51,13 @@ def run(
         stdin=subprocess.DEVNULL,
         check=False,
     )
+
+
+def parsers() -> list[argparse.ArgumentParser]:
+    """The parsers of both commands, and those of the subcommands."""
+    capsule = cli._capsule_parser("capsule-id")
+    (commands,) = (action for action in capsule._actions if isinstance(action, argparse._SubParsersAction))
+    return [cli._fit_parser("fit-params"), capsule, *commands.choices.values()]
 
 
 def small_rig(folder: Path, name: str = "small", tables: tuple[str, ...] = ("static_friction",)) -> Path:

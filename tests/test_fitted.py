@@ -23,7 +23,7 @@ from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import BLOCKS
 from capsule_id.inference.result import Pointwise, Posterior
-from capsule_id.report.write import _digest
+from capsule_id.report.write import _digest, parameters_json
 from capsule_id.synthetic import truth_beside
 from capsule_id.views import Finding, Level
 from tests.cli_tools import DATA, listing, small_rig
@@ -192,6 +192,44 @@ def test_plots_of_absent_data_say_what_is_there(fitted: Fit) -> None:
         fitted.plot_record()
     with pytest.raises(InputError, match="choose from motor_current, support_spring_soft"):
         fitted.plot_comparison("pushes")
+
+
+def test_a_parameter_by_its_name_has_the_numbers_of_the_files(capsule: Fit) -> None:
+    saved: Any = parameters_json(capsule)["parameters"]
+    assert list(capsule.parameters) == list(saved) == list(capsule)
+    for name, stated in saved.items():
+        own = capsule[name]
+        assert (own.name, own.unit, own.value, own.sd) == (name, stated["unit"], stated["value"], stated["sd"])
+        assert (own.trust, [own.lower, own.upper]) == (stated["trust"], stated["ci95"])
+    k1 = capsule["k1"]
+    assert re.fullmatch(r"k1 = \d+(\.\d+)? ± \d+(\.\d+)? N/m, (not )?(trusted|judged)", str(k1))
+    assert str(k1).split(" ± ")[0].removeprefix("k1 = ") in capsule.parameter_table
+    assert ("k1" in capsule, "k9" in capsule, 0 in capsule) == (True, False, False)
+
+
+@pytest.mark.parametrize(
+    ("word", "near"),
+    [
+        ("k2", "choose from k2[soft]"),
+        ("K1", "choose from "),
+        ("v", "choose from "),
+        ("vs", "v_s"),
+        ("zzz", "m1, m2, k1"),
+    ],
+)
+def test_an_unknown_name_lists_those_near_it(capsule: Fit, word: str, near: str) -> None:
+    with pytest.raises(InputError, match="the result must have this parameter") as error:
+        capsule[word]
+    assert near in str(error.value)
+
+
+def test_a_table_by_its_code(capsule: Fit) -> None:
+    (note,) = (note for note in capsule.notes if note.code == "parameters.priors")
+    pd.testing.assert_frame_equal(capsule.table("parameters.priors"), note.frame)
+    twice = dataclasses.replace(capsule, notes=(note, *capsule.notes))
+    assert len(twice.table("parameters.priors")) == 2 * len(note.frame)
+    with pytest.raises(InputError, match=r"this table, 'parameter\.prior', choose from parameters\.priors"):
+        capsule.table("parameter.prior")
 
 
 def test_simulate_runs_the_capsule_for_draws(capsule: Fit) -> None:

@@ -1,6 +1,5 @@
 """README and the guide are correct: their commands run, their tables are those of the package."""
 
-import argparse
 import re
 import shlex
 import tomllib
@@ -20,7 +19,7 @@ from capsule_id.report.columns import COLUMNS
 from capsule_id.rig.model import ModelChoices
 from capsule_id.rig.schema import OPTIONAL
 from capsule_id.views import Trust
-from tests.cli_tools import ROOT
+from tests.cli_tools import ROOT, parsers
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 GUIDE_FOLDER = ROOT / "capsule_id" / "guide"
@@ -222,13 +221,6 @@ def test_every_path_that_the_texts_name_exists() -> None:
 def test_the_exit_codes_are_those_of_the_command() -> None:
     table = rows("| exit code | meaning |", GUIDE["results"])
     assert set(table) == {"0", "3", *map(str, (cli.BAD_INPUT, cli.INTERNAL, cli.INTERRUPTED))}
-
-
-def parsers() -> list[argparse.ArgumentParser]:
-    """The parsers of both commands, and those of the subcommands."""
-    capsule = cli._capsule_parser("capsule-id")
-    (commands,) = (action for action in capsule._actions if isinstance(action, argparse._SubParsersAction))
-    return [cli._fit_parser("fit-params"), capsule, *commands.choices.values()]
 
 
 def test_every_command_and_option_is_understood() -> None:

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from capsule_id.commands import PATH
+from capsule_id.commands import PATH, rig_folders
 from capsule_id.console import say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry, rough_values
@@ -18,7 +18,7 @@ from capsule_id.views import Finding, counted
 
 OPTIONS = {
     "": (
-        ("data", "DATA", "rig folder, with its rig.toml"),
+        ("data", "DATA", "rig folder, with its rig.toml (default: this folder)", {"nargs": "?"}),
         ("--figures", "DIR", "draw every experiment with its findings into DIR", PATH),
     )
 }
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         If the folder is not a valid rig, or DIR cannot be written.
     """
     kinds = default_registry()
-    rig = read_rig(args.data, kinds)
+    rig = read_rig(*rig_folders([args.data] if args.data is not None else []), kinds)
     lines = [f"{rig.name}: {counted(len(rig.tables), 'experiment')}{', SYNTHETIC data' if rig.synthetic else ''}"]
     lines += [_summary(table) for table in rig.tables]
     lines += [f"{table.label}: {line}" for table in rig.tables for line in kinds[table.kind].describe(table)]
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     lines += [f"{finding.level}: {finding_text(finding, messages)}" for finding in findings]
     if args.figures is not None:
         lines += _draw(rig, findings, args.figures)
-    say("\n".join([*lines, counted(len(findings), "finding") if findings else "no findings"]))
+    say("\n".join([*lines, counted(len(findings), "finding") if findings else "no findings"]), coloured=True)
     return 0
 
 

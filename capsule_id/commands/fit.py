@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from capsule_id.commands import NO_CACHE, PATH
+from capsule_id.commands import NO_CACHE, PATH, rig_folders
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.rigs import fit_many, fit_one
 from capsule_id.console import Progress, say
@@ -21,7 +21,7 @@ DEFAULT_MAX_STEPS, DEFAULT_ESS = 2500, 1000
 
 OPTIONS = {
     "": (
-        ("data", "DATA", "rig folder: rig.toml and the tables that it names", {"nargs": "+"}),
+        ("data", "DATA", "rig folder: rig.toml and the tables that it names (default: this folder)", {"nargs": "*"}),
         ("--out", "DIR", "result directory (default results/<rig name>); of several rigs DIR/<rig name>", PATH),
         (
             "--scheduler",
@@ -75,11 +75,11 @@ def run(args: argparse.Namespace) -> int:
         if value < 1:
             raise InputError(f"{option} must be positive", str(value), "give 1 or more")
     kinds = default_registry()
-    rigs = [read_rig(folder, kinds) for folder in args.data]
+    rigs = [read_rig(folder, kinds) for folder in rig_folders(args.data)]
     if args.compare is not None:
         return _compare(args, rigs, kinds)
     args.budget = None if args.no_sample else args.max_steps
-    args.command = shlex.join(["fit-params", *sys.argv[1:]])
+    args.command = shlex.join([args.program.split()[0], *sys.argv[1:]])
     root = args.out or Path("results")
     if len(rigs) > 1:
         if args.resume or args.json:

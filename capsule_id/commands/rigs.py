@@ -101,7 +101,9 @@ def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, prog
 
         def show_point(first: "Fit") -> None:
             write_file(unfinished / "report.html", render(first, ()))
-            progress.note(f"point fit, before the sample; report: {unfinished / 'report.html'}\n{first.table}")
+            progress.note(
+                f"point fit, before the sample; report: {unfinished / 'report.html'}\n{first.parameter_table}"
+            )
 
         # A fit of bench tests ends as soon.
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
@@ -114,9 +116,9 @@ def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, prog
     if options.json:
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
     else:
-        say(f"{result.table}\nreport: {report}\n{result.verdict}")
+        say(f"{result.parameter_table}\nreport: {report}\n{result.verdict}", coloured=True)
     if not result.clean:
-        complain(f"fit-params: verdict not clean: {', '.join(result.failed)}; see {report}")
+        complain(f"{options.program}: verdict not clean: {', '.join(result.failed)}; see {report}")
     return CLEAN if result.clean else NOT_CLEAN
 
 
@@ -178,13 +180,13 @@ def fit_many(
                 traceback = "" if isinstance(error, InputError | OSError) else f"; {save_traceback(error)}"
                 failures.append(f"{rig.name} ({one_line(error)}{traceback})")
             else:
-                say(line)
+                say(line, coloured=True)
                 unclean += [rig.name] * (not clean)
             progress(done, len(rigs), "rigs")
     parts = [f"verdict not clean: {', '.join(unclean)}"] * bool(unclean)
     parts += [f"{counted(len(failures), 'rig')} not fitted: {'; '.join(failures)}"] * bool(failures)
     if parts:
-        complain(f"fit-params: {'; '.join(parts)}")
+        complain(f"{options.program}: {'; '.join(parts)}")
     return FAILED if failures else NOT_CLEAN if unclean else CLEAN
 
 

@@ -19,7 +19,7 @@ from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.precision import require_float64
 from capsule_id.records.view import RunRecord
 from capsule_id.rig.model import NO_DRIFT, Column, Rig, Table
-from capsule_id.views import Comparison, Facts, Finding, ResultTable
+from capsule_id.views import Comparison, Facts, Finding, ResultTable, with_unit
 
 # base: Base class of experiments: their interface to inference and to the report.
 #
@@ -376,8 +376,8 @@ def scatter_prior(size: float) -> Prior:
 
 
 def axis_label(column: Column) -> str:
-    """Return the axis label ``name [unit]``."""
-    return f"{column.name} [{column.unit}]"
+    """Return the axis label ``name, unit``."""
+    return with_unit(column.name, column.unit)
 
 
 def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -249,8 +249,8 @@ def friction_panels(
         "friction",
         "friction",
         "Friction coefficient against velocity",
-        "velocity [m/s]",
-        "friction coefficient [1]",
+        "velocity, m/s",
+        "friction coefficient",
         tuple(points),
         tuple(curves),
     )

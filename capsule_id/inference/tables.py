@@ -36,9 +36,10 @@ def precision_gained(s: SampledFit) -> ResultTable:
     alone = runs_alone(target, joint)
     runs = {name: sd * abs(joint.values[name]) if name in known else np.nan for name, (_, sd) in alone.items()}
     rows = {}
-    for name in (row.name for row in target.parameters if row.symbol in shared):
-        rows[name] = [_sd(s.bench, s.bench_sample, name), runs[name], _sd(joint, s.posterior, name)]
-    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["bench only", "runs only", "both"])
+    for row in (row for row in target.parameters if row.symbol in shared):
+        sds = _sd(s.bench, s.bench_sample, row.name), runs[row.name], _sd(joint, s.posterior, row.name)
+        rows[row.name] = [row.unit, *sds]
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["unit", "bench only", "runs only", "both"])
     frame["bench only / both"] = frame["bench only"] / frame["both"]
     return ResultTable("runs.precision", frame.rename_axis("parameter"))
 

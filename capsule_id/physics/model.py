@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from capsule_id.errors import InputError
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module, is_traced
 from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, Series, downhill, rod_on_capsule
@@ -106,19 +107,53 @@ class PeriodicDrive(Drive, Protocol):
         ...
 
 
+#: In place of a frequency that is not stated. The object is compared, so that NaN may be stated.
+_UNSTATED = float("nan")
+
+
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Excitation(Drive):
     """The drive P_d cos(Omega t + phase) on the rod: P_d in N, Omega in rad/s, phase in rad; leaves () or (batch,).
 
+    f : Hz, in place of Omega = 2 pi f
     reaction : share of the force that pushes the capsule back, 1: 0 for a force from outside, 1 for an actuator
         between rod and capsule
+
+    Raises
+    ------
+    InputError
+        If both Omega and f are stated, or neither.
     """
 
     P_d: NumberOrBatch
     Omega: NumberOrBatch
     phase: NumberOrBatch = 0.0
     reaction: NumberOrBatch | None = 0.0
+
+    def __init__(
+        self,
+        P_d: NumberOrBatch,
+        Omega: NumberOrBatch = _UNSTATED,
+        phase: NumberOrBatch = 0.0,
+        reaction: NumberOrBatch | None = 0.0,
+        *,
+        f: NumberOrBatch | None = None,
+    ) -> None:
+        if (Omega is _UNSTATED) == (f is None):
+            found = "neither" if f is None else "both"
+            raise InputError(
+                "a harmonic drive has one frequency", f"{found} of Omega and f", "give Omega, rad/s, or f, Hz"
+            )
+        # JAX builds copies from all four leaves, traced or not: nothing may look at them.
+        Omega = Omega if f is None else 2.0 * np.pi * f
+        for name, value in {"P_d": P_d, "Omega": Omega, "phase": phase, "reaction": reaction}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def f(self) -> Any:
+        """Omega / (2 pi), Hz; () or (batch,)."""
+        return self.Omega / (2.0 * np.pi)
 
     parameters: ClassVar[tuple[Parameter, ...]] = tuple(TABLE[name] for name in DRIVES["harmonic"])
 

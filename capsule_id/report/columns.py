@@ -3,6 +3,7 @@
 import math
 import re
 import shutil
+import string
 import textwrap
 import unicodedata
 from collections import defaultdict
@@ -12,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from capsule_id.inference.result import Posterior, Result
 from capsule_id.parameters import INSTRUMENT_WORDS, Name, is_stated, symbol_of
@@ -175,12 +177,13 @@ class Row:
         return f"{self.number('value')}({digits}){after_number(self.unit)}"
 
 
-def table_rows(frame: pd.DataFrame) -> list[Row]:
-    """The rows of ``frame`` in their order. Those of a symbol share the unit of the largest."""
+def table_rows(frame: pd.DataFrame, beside: Sequence[pd.DataFrame] = ()) -> list[Row]:
+    """The rows of ``frame`` in their order. Those of a symbol, also in the tables ``beside``, share the unit of the largest."""
     values_of = {str(name): values for name, values in frame.to_dict("index").items()}
     largest: defaultdict[str, float] = defaultdict(float)
-    for name, values in values_of.items():
-        largest[symbol_of(name)] = max(largest[symbol_of(name)], magnitude(values))
+    for part in (frame, *beside):
+        for name, values in part.to_dict("index").items():
+            largest[symbol_of(str(name))] = max(largest[symbol_of(str(name))], magnitude(values))
     rows = []
     for name, values in values_of.items():
         scale, unit = prefix_for(str(values["unit"]), largest[symbol_of(name)])
@@ -342,13 +345,63 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = No
     shown = len(widths)
     while shown > 1 + KEPT and sum(widths[:shown]) + len(_GAP) * (shown - 1) > width:
         shown -= 1
-    aligned = [f"{'>' if i > 1 else '<'}{longest}" for i, longest in enumerate(widths[:shown])]
-    lines = [_GAP.join(map(format, cells[:shown], aligned)).rstrip() for cells in table]
-    rule = "-" * max(map(len, lines))
+    lines = _aligned([cells[:shown] for cells in table])
     skewed, left_out = skewed_names(summary), table[0][shown:]
     notes = [f"{', '.join(skewed)}: skewed; quote the value with its 95 % interval"] if skewed else []
     notes += [f"in a wider terminal and in report.html: {', '.join(left_out)}"] if left_out else []
-    return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:], *wrapped(notes, width)])
+    return "\n".join([*([SYNTHETIC] if synthetic else []), *lines, *wrapped(notes, width)])
+
+
+def _aligned(table: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table, a rule under the first one. Names and units are flush left."""
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    form = [f"{'>' if i > 1 else '<'}{longest}" for i, longest in enumerate(widths)]
+    head, *lines = (_GAP.join(map(format, cells, form)).rstrip() for cells in table)
+    return [head, "-" * max(map(len, [head, *lines])), *lines]
+
+
+#: Probability that ``differences`` calls any parameter of two equal rigs different.
+FALSE_ALARMS = 0.05
+
+
+def differences(one: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
+    """Differences of the parameters that two summaries have in common; the table of ``capsule_id.compare``."""
+    names = [name for name in one.index if name in other.index]
+    frame = pd.DataFrame({"unit": one.loc[names, "unit"]}, index=pd.Index(names, name="name"))
+    for word, part in (("a", one.loc[names]), ("b", other.loc[names])):
+        frame[f"value_{word}"], frame[f"sd_{word}"] = part["value"].astype(float), part["sd"].astype(float)
+    frame["difference"] = frame["value_b"] - frame["value_a"]
+    frame["sd"] = np.hypot(frame["sd_a"], frame["sd_b"])
+    # Two exact constants have no sd: equal ones are 0 sd apart, others infinitely many.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        frame["sds"] = np.where(frame["difference"] == 0.0, 0.0, frame["difference"] / frame["sd"])
+    frame["differs"] = frame["sds"].abs() > stats.norm.isf(FALSE_ALARMS / 2.0 / max(len(names), 1))
+    return frame
+
+
+def table_side_by_side(summaries: Sequence[pd.DataFrame]) -> str:
+    """One table of several results A, B, C: value ± sd of each, and the differences from A in sd of the difference.
+
+    A word of trust stands behind the numbers of a parameter that is not trusted.
+    """
+    letters = string.ascii_uppercase[: len(summaries)]
+    results = [{row.name: row for row in table_rows(one, summaries)} for one in summaries]
+    compared = [differences(summaries[0], other) for other in summaries[1:]]
+    table = [["", "unit", *letters, *(f"{letter} − A, sd" for letter in letters[1:])]]
+    for name in dict.fromkeys(name for rows in results for name in rows):
+        own = [rows.get(name) for rows in results]
+        words = ["" if row is None or row.values["trust"] == "trusted" else f" ({row.values['trust']})" for row in own]
+        values = [row.quoted + word if row else MISSING for row, word in zip(own, words, strict=True)]
+        sds = [float(frame["sds"].get(name, math.nan)) for frame in compared]
+        unit = next(row.unit for row in own if row)
+        table.append([name, unit, *values, *(MISSING if math.isnan(x) else f"{x:+.1f}" for x in sds)])
+    differing = [", ".join(str(name) for name, differs in frame["differs"].items() if differs) for frame in compared]
+    texts = [
+        f"{letter} differs from A in {names or 'no parameter that both have'}"
+        for letter, names in zip(letters[1:], differing, strict=True)
+    ]
+    chance = f"two fits of equal rigs differ so in any parameter with a probability of {100 * FALSE_ALARMS:.0f} %"
+    return "\n".join([*_aligned(table), *wrapped([*texts, chance])])
 
 
 def wrapped(texts: Sequence[str], width: int | None = None) -> list[str]:

@@ -137,8 +137,8 @@ def _group(result: Result, label: str) -> str:
 def _drawings_of_record(record: RunRecord, label: str, group: str) -> Iterator[Drawing]:
     """The record as the paper draws it (its Figs. 4 and 9); ``label`` is safe and unique."""
     view, contact = record.view, record.view.at_contact
-    left = f"{view.at_drive.rate:.0%} of a rate at the drive's frequency" + (
-        f" and {contact.rate:.0%} at that of the contacts ({contact.f:.3g} Hz)" if contact else ""
+    left = f"{100.0 * view.at_drive.rate:.0f} % of a rate at the drive's frequency" + (
+        f" and {100.0 * contact.rate:.0f} % at that of the contacts ({contact.f:.3g} Hz)" if contact else ""
     )
     caption = (
         "The record itself: raw channels, and the phase plane through Savitzky–Golay with the impact line and a point a "
@@ -172,7 +172,7 @@ def comparison_alt(item: Comparison) -> str:
     if item.residuals is not None and item.residuals.size:
         size = np.abs(item.residuals)
         inside = np.mean(size <= QUANTILE_975)
-        parts.append(f"{inside:.0%} of the residuals within ±1.96 sd, the largest {np.max(size):.2g} sd")
+        parts.append(f"{100.0 * inside:.0f} % of the residuals within ±1.96 sd, the largest {np.max(size):.2g} sd")
     flagged = sum(int(points.flagged.sum()) for points in item.points if points.flagged is not None)
     parts += [f"{flagged} rows flagged by a check"] if flagged else []
     return "; ".join(parts) + "."

@@ -283,14 +283,24 @@ def _class(names: Sequence[str], roots: set[str]) -> Any:
 # netcdf: ``posterior.nc``: the sample in the groups and dimensions that ArviZ knows.
 
 
+# Of an array in a file; a higher level takes three times as long for a hundredth of the size.
+_PACKED = {"zlib": True, "complevel": 2, "shuffle": True}
 # The extra dimension of bracketed names; every other family gets "<base>_of".
 _DIMENSIONS = {"k2": "spring"}
 
 
 def netcdf_bytes(data: xr.DataTree | xr.Dataset) -> bytes:
-    """``data`` as a netCDF file (h5netcdf). It is made in memory: HDF5 ends the process where the disk is full."""
+    """``data`` as a netCDF file (h5netcdf). It is made in memory: HDF5 ends the process where the disk is full.
+
+    The arrays of a tree are compressed without loss: a walker that stays repeats its draw.
+    """
     file = io.BytesIO()
-    data.to_netcdf(file, engine="h5netcdf")
+    if isinstance(data, xr.Dataset):
+        data.to_netcdf(file, engine="h5netcdf")
+    else:
+        arrays = {node.path: [name for name, own in node.data_vars.items() if own.size > 1] for node in data.subtree}
+        packed = {path: {name: dict(_PACKED) for name in names} for path, names in arrays.items()}
+        data.to_netcdf(file, engine="h5netcdf", encoding=packed)
     return file.getvalue()
 
 

@@ -2,13 +2,14 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
+from capsule_id.errors import InputError
 from capsule_id.parameters import Prior
 from capsule_id.views import Finding, counted
 
@@ -23,6 +24,8 @@ class Quantity:
 
 #: Relative difference below which numbers of two programs are the same, and largest rounding error of a converted number.
 SAME, ROUNDING = 1e-9, 1e-12
+#: Fewest samples of a record: six unknowns of a free decay (k1, c, amplitude, phase, offset, noise) and two more.
+SHORTEST_RECORD = 8
 #: A clock that agrees with true time.
 NO_DRIFT = Quantity(0.0)
 
@@ -219,3 +222,70 @@ class Rig:
     def has_runs(self) -> bool:
         """Whether any table is a forced run."""
         return any(not table.bench for table in self.tables)
+
+    def without(self, label: str) -> "Rig":
+        """The rig without the experiment ``label``, such as ``rig.without("run_2")``.
+
+        Raises
+        ------
+        InputError
+            If the rig has no such experiment, or no other one.
+        """
+        unwanted = self._labelled(label)
+        if len(self.tables) == 1:
+            raise InputError("a rig must keep an experiment", f"{label} is its only one", "keep it")
+        kept = tuple(table for table in self.tables if table is not unwanted)
+        gone = {unwanted.file, *unwanted.encodings} - {file for one in kept for file in (one.file, *one.encodings)}
+        return replace(self, tables=kept, files={file: own for file, own in self.files.items() if file not in gone})
+
+    def cut(self, label: str, start: float | None = None, stop: float | None = None) -> "Rig":
+        """The rig with the record ``label`` from ``start`` to ``stop`` alone, such as ``rig.cut("run_1", stop=2.0)``.
+
+        A free vibration then has this ``start`` and ``stop`` as if ``rig.toml`` stated them. The state that ``start``
+        states for the first sample of a forced run ("stuck", "moving") does not hold for another sample: "auto".
+
+        Parameters
+        ----------
+        start, stop : s, both included, on the clock of the record; None: its first and last sample
+
+        Raises
+        ------
+        InputError
+            If the rig has no such experiment, it is no record, or fewer than 8 of its samples are left.
+        """
+        table = self._labelled(label)
+        records = ", ".join(one.label for one in self.tables if "time" in one.columns)
+        if "time" not in table.columns:
+            raise InputError("cut takes a record", f"{label} has no column time", f"choose from {records or 'none'}")
+        time, settings = table["time"], table.settings
+        windowed = hasattr(settings, "stop")
+        if windowed:
+            start, stop = settings.start if start is None else start, settings.stop if stop is None else stop
+        low, high = -np.inf if start is None else start, np.inf if stop is None else stop
+        inside = (time >= low) & (time <= high)
+        if (left := int(np.count_nonzero(inside))) < SHORTEST_RECORD:
+            span = f"choose times between {time[0]:g} and {time[-1]:g} s"
+            rule = f"at least {SHORTEST_RECORD} samples must lie between start and stop"
+            raise InputError(rule, f"{counted(left, 'sample')} of {label}", span)
+        if windowed:
+            table = replace(table, settings=replace(settings, start=start, stop=stop))
+        else:
+            if not inside[0] and getattr(settings, "start", "") in ("stuck", "moving"):
+                settings = replace(settings, start="auto")
+            columns = {name: replace(one, values=_frozen(one.values[inside])) for name, one in table.columns.items()}
+            table = replace(table, columns=columns, rows=_frozen(table.rows[inside]), settings=settings)
+        return replace(self, tables=tuple(table if one.label == label else one for one in self.tables))
+
+    def _labelled(self, label: str) -> Table[Any]:
+        """The experiment ``label``."""
+        for table in self.tables:
+            if table.label == label:
+                return table
+        known = ", ".join(table.label for table in self.tables)
+        raise InputError("the label must be that of an experiment of the rig", repr(label), f"choose from {known}")
+
+
+def _frozen(values: np.ndarray) -> np.ndarray:
+    """``values``, read-only."""
+    values.setflags(write=False)
+    return values

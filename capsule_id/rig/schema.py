@@ -20,15 +20,11 @@ from typing import (
 from capsule_id.errors import InputError
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.model import ModelChoices, Quantity, S, Settings, Table
+from capsule_id.rig.model import SHORTEST_RECORD, ModelChoices, Quantity, S, Settings, Table
 from capsule_id.rig.toml import ANY, INCLINE, POSITIVE, Domain, Node, is_count, remedy_for, shown
 from capsule_id.views import counted
 
 # schema: Types for the columns, settings and rules of a kind of experiment. The reader uses no other type of a kind.
-
-
-#: Fewest samples of a record: six unknowns of a free decay (k1, c, amplitude, phase, offset, noise) and two more.
-SHORTEST_RECORD = 8
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,23 @@
 """Exit codes and standard error of both commands, without a fit."""
 
+import argparse
+import json
+import math
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from capsule_id import cli, console
 from capsule_id.cli import capsule_id, fit_params
-from tests.cli_tools import DATA, argv, environment, listing, run, small_rig
+from capsule_id.views import Level, Trust
+from tests.cli_tools import DATA, argv, environment, listing, parsers, run, small_rig
 
 HEAVY = ("jax", "matplotlib", "pandas", "emcee", "equinox", "optimistix", "xarray")
 
@@ -66,9 +74,127 @@ def test_wrong_usage_is_one_line(capsys: pytest.CaptureFixture[str], words: tupl
     assert named in refused(capsys, *words)
 
 
-@pytest.mark.parametrize("words", [("fit",), ("init",), ("check", "a", "b"), ("synthesize", "a", "--seed", "x")])
+@pytest.mark.parametrize(
+    "words", [("fit", "--seed"), ("init",), ("check", "a", "b"), ("synthesize", "a", "--seed", "x")]
+)
 def test_wrong_usage_of_the_second_command(capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
     assert "--help" in refused(capsys, *words, program="capsule_id")
+
+
+@pytest.mark.parametrize(
+    ("program", "words", "meant"),
+    [
+        ("capsule_id", ("chekc", "rig"), "check"),
+        ("capsule_id", ("synthesise", "rig"), "synthesize"),
+        ("capsule_id", ("fit", "rig", "--experiments", "banch"), "bench"),
+        ("fit_params", ("rig", "--experiments", "run"), "runs"),
+        ("capsule_id", ("zzz",), None),
+    ],
+)
+def test_a_mistyped_word_is_answered_with_the_meant_one(
+    capsys: pytest.CaptureFixture[str], program: str, words: tuple[str, ...], meant: str | None
+) -> None:
+    line = refused(capsys, *words, program=program)
+    assert ("did you mean" in line) == (meant is not None)
+    assert meant is None or f"; did you mean {meant}?; see " in line
+
+
+def test_every_help_has_an_example_that_parses() -> None:
+    for parser in parsers():
+        example = parser.format_help().partition("example: ")[2].partition(";")[0]
+        program, *words = shlex.split(example)
+        whole = {"fit-params": cli._fit_parser, "capsule-id": cli._capsule_parser}[program](program)
+        assert whole.parse_args(words).run is not None
+        assert example.startswith(parser.prog)
+
+
+@pytest.mark.parametrize(
+    ("program", "words"), [("fit_params", ()), ("capsule_id", ("fit",)), ("capsule_id", ("check",))]
+)
+def test_the_working_folder_is_the_default_rig(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    program: str,
+    words: tuple[str, ...],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = refused(capsys, *words, program=program)
+    assert line.startswith(
+        "DATA must be a rig folder, none is named, and the working folder has no rig.toml, name a rig"
+    )
+    monkeypatch.chdir(small_rig(tmp_path / "rig", name="here"))
+    if words == ("check",):
+        assert capsule_id(words) == 0
+        assert capsys.readouterr().out.startswith("here: 1 experiment")
+    else:  # it reads the folder
+        assert "--experiments runs" in refused(capsys, *words, "--experiments", "runs", program=program)
+
+
+def test_capsule_id_fit_is_fit_params(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = str(small_rig(tmp_path / "rig"))
+    capsule, alone = cli._capsule_parser("capsule-id"), cli._fit_parser("fit-params")
+    (commands,) = (action for action in capsule._actions if isinstance(action, argparse._SubParsersAction))
+    options = [{*parser._option_string_actions} - {"--version"} for parser in (commands.choices["fit"], alone)]
+    assert options[0] == options[1]
+    said = []
+    for call, words in ((fit_params, ()), (capsule_id, ("fit",))):
+        assert call([*words, rig, "--no-sample", "--quiet", "--out", str(tmp_path / call.__name__)]) == 0
+        said.append(capsys.readouterr().out.replace(f"/{call.__name__}/", "/"))
+    assert said[0] == said[1]
+    one, other = (tmp_path / name / "parameters.json" for name in ("fit_params", "capsule_id"))
+    assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("terminal", "NO_COLOR", "TERM", "coloured"),
+    [(True, "", "xterm", True), (True, "1", "xterm", False), (True, "", "dumb", False), (False, "", "xterm", False)],
+)
+def test_colours_on_a_terminal_alone(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    terminal: bool, NO_COLOR: str, TERM: str, coloured: bool,
+) -> None:  # fmt: skip
+    """Without colours the text is the same; a text of a file brings none of its own."""
+    monkeypatch.setenv("NO_COLOR", NO_COLOR)
+    monkeypatch.setenv("TERM", TERM)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal, raising=False)
+    text = "k1  1422 ± 3  not trusted\nwarn: a\x1b[1m check is ok\nverdict: trusted"
+    console.say(text, coloured=True)
+    out = capsys.readouterr().out
+    assert ("\x1b[31mnot trusted\x1b[0m" in out, "\x1b[33mwarn\x1b[0m:" in out, "\x1b[32mtrusted" in out) == (
+        coloured,
+    ) * 3
+    assert re.sub(r"\x1b\[\d*m", "", out) == text.replace("\x1b", "\\u001b") + "\n"
+    console.say(text)
+    assert "\x1b" not in capsys.readouterr().out
+    assert {*console._COLOURS} == {*get_args(Level), *get_args(Trust)}
+
+
+def test_report_puts_results_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One unit a row, differences in sd, the verdict of each, and a word about readings that both have."""
+    folders = [tmp_path / name for name in ("one", "two", "three")]
+    fit_params([str(small_rig(tmp_path / "rig")), "--no-sample", "--quiet", "--out", str(folders[0])])
+    text = (folders[0] / "parameters.json").read_text(encoding="utf-8")
+    saved = json.loads(text)
+    mu = saved["parameters"]["mu"]
+    for folder, moved, name in ((folders[1], 5.0, "mu"), (folders[2], 0.5, "v_s")):
+        folder.mkdir()
+        changed = {**mu, "value": mu["value"] + moved * math.sqrt(2.0) * mu["sd"], "trust": "not trusted"}
+        other = {**saved, "parameters": {name: changed}, "provenance": {"files": {"other.csv": folder.name}}}
+        (folder / "parameters.json").write_text(json.dumps(other), encoding="utf-8")
+    capsys.readouterr()
+    assert capsule_id(["report", *map(str, folders)]) == 0
+    head, _, first, second, *rest = capsys.readouterr().out.splitlines()
+    assert head.split() == ["unit", "A", "B", "C", "B", "−", "A,", "sd", "C", "−", "A,", "sd"]
+    assert re.fullmatch(r"mu +1 +0\.\d+ ± 0\.\d+ \(not judged\) +0\.\d+ ± 0\.\d+ \(not trusted\) +– +\+5\.0 +–", first)
+    assert re.fullmatch(r"v_s +1 +– +– +0\.\d+ ± 0\.\d+ \(not trusted\) +– +–", second)
+    assert rest[:2] == ["B differs from A in mu", "C differs from A in no parameter that both have"]
+    assert "shares" not in "".join(rest)
+    capsule_id(["report", str(folders[0]), str(folders[0])])
+    assert "it shares rig.toml, static_friction.csv with A" in " ".join(capsys.readouterr().out.split())
+    assert "--json is for one result" in refused(capsys, "report", "a", "b", "--json", program="capsule_id")
+    assert "run fit-params first" in refused(capsys, "report", str(folders[0]), "b", program="capsule_id")
 
 
 def test_synthesize_refuses_and_leaves_nothing(

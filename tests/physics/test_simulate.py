@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -119,3 +121,27 @@ def test_values_traced_in_single_precision_are_refused() -> None:
 def test_reverse_mode_is_refused_by_jax() -> None:
     with pytest.raises(ValueError, match=r"[Rr]everse-mode"):
         jax.grad(lambda P_d: simulate(P, Excitation(P_d, 34.56), TIMES).X2[-1])(4.0)
+
+
+def test_a_frequency_in_hertz_is_the_same_drive() -> None:
+    """Numbers, batches, traced values and derivatives: f stands for Omega = 2 pi f."""
+    times, f = np.linspace(0.0, 0.2, 20), np.array([5.0, 5.5])
+    drive = Excitation(P_d=4.0, f=f)
+    np.testing.assert_array_equal(drive.Omega, 2.0 * np.pi * f)
+    np.testing.assert_allclose(drive.f, f, rtol=1e-15)
+    both = simulate(P, drive, times).X1
+    np.testing.assert_array_equal(both, simulate(P, Excitation(4.0, 2.0 * np.pi * f), times).X1)
+
+    def end(f: Any) -> Any:
+        return simulate(P, Excitation(P_d=4.0, f=f), times).X1[-1]
+
+    value, rate = jax.jvp(jax.jit(end), (5.5,), (1.0,))
+    assert value == pytest.approx(float(both[1, -1]), rel=1e-9)
+    assert rate == pytest.approx(float(end(5.5 + 1e-4) - end(5.5 - 1e-4)) / 2e-4, rel=1e-4)
+    assert replace(Excitation(4.0, f=5.5), P_d=3.0) == Excitation(3.0, 2.0 * np.pi * 5.5)
+
+
+@pytest.mark.parametrize(("stated", "found"), [({}, "neither"), ({"Omega": 34.0, "f": 5.0}, "both")])
+def test_a_harmonic_drive_has_one_frequency(stated: dict[str, float], found: str) -> None:
+    with pytest.raises(InputError, match=f"one frequency, {found} of Omega and f, give Omega, rad/s, or f, Hz"):
+        Excitation(P_d=4.0, **stated)

@@ -67,7 +67,7 @@ def _friction(rng: np.random.Generator) -> Comparison:
     paper = 0.33 * (1 + np.exp(-v / 0.465))
     speeds = np.array([0.15, 0.3, 0.5, 0.75, 1.0])
     return Comparison(
-        "friction", "friction", "Friction coefficient against velocity", "velocity [m/s]", "friction coefficient [1]",
+        "friction", "friction", "Friction coefficient against velocity", "velocity, m/s", "friction coefficient",
         points=(
             Points("static tests (tilt)", np.zeros(4), 0.66 + 0.01 * rng.normal(size=4), role="static"),
             Points("pushes, read as mu at v", speeds, np.interp(speeds, v, paper), np.full(5, 0.01), role="dynamic"),
@@ -89,7 +89,7 @@ def _line(kind: str, label: str, slope: float, rng: np.random.Generator) -> Comp
     flagged[4] = label == "support_spring_stiff"
     return Comparison(
         kind, label, "Current against force" if current else f"Support spring {label.removeprefix('support_spring_')}",
-        "motor current [A]" if current else "deflection [mm]", "force [N]",
+        "motor current, A" if current else "deflection, mm", "force, N",
         points=(Points("measured", x, slope * x + noise, flagged=flagged),),
         curves=(Curve("this fit", x, slope * x, 0.998 * slope * x, 1.002 * slope * x),),
         residuals=noise / np.std(noise), predictive_p=0.62,
@@ -104,8 +104,8 @@ def _decay(number: int, rng: np.random.Generator, n: int = 1000) -> Comparison:
     white = residuals - residuals.mean()
     autocorrelation = np.array([np.dot(white[:-lag], white[lag:]) for lag in lags]) / np.dot(white, white)
     return Comparison(
-        "free_vibration", f"free_vibration_{number}", f"Free vibration free_vibration_{number}", "time [s]",
-        "relative displacement [mm]",
+        "free_vibration", f"free_vibration_{number}", f"Free vibration free_vibration_{number}", "time, s",
+        "relative displacement, mm",
         points=(Points("measured", t, clean + 0.01 * (1 + number) * residuals),),
         curves=(Curve("this fit", t, clean, clean - 0.02, clean + 0.02),),
         residuals=residuals, autocorrelation=autocorrelation,

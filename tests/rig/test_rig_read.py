@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from capsule_id.experiments.free_vibration.readings import decay_window
 from capsule_id.experiments.kind import default_registry
 from capsule_id.parameters import Prior
 from capsule_id.rig.model import Quantity, Table
+from tests.cli_tools import DATA, small_rig
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 
 DEGREE = math.pi / 180.0
@@ -201,3 +203,63 @@ def test_the_same_file_may_be_used_under_two_labels(tmp_path: Path) -> None:
         read_rig(write_folder(tmp_path / "rig", RIG_TOML + twice))
     rig = read_rig(write_folder(tmp_path / "rig", RIG_TOML + twice + 'label = "again"\n'))
     assert [table.label for table in rig.tables if table.file == "static_friction.csv"] == ["static_friction", "again"]
+
+
+def test_a_rig_without_an_experiment(tmp_path: Path) -> None:
+    rig = read_rig(DATA)
+    rest = rig.without("run_2")
+    assert [table.label for table in rest.tables] == [one.label for one in rig.tables if one.label != "run_2"]
+    assert set(rig.files) - set(rest.files) == {next(one.file for one in rig.tables if one.label == "run_2")}
+    assert dataclasses.replace(rest, tables=rig.tables, files=rig.files) == rig
+    alone = read_rig(small_rig(tmp_path / "rig"))
+    with pytest.raises(InputError, match="a rig must keep an experiment, static_friction is its only one"):
+        alone.without("static_friction")
+
+
+def test_a_record_is_cut_between_two_times(tmp_path: Path) -> None:
+    """A free decay as by ``start`` and ``stop`` in ``rig.toml``, a run by its rows."""
+    rig = read_rig(DATA)
+    folder = shutil.copytree(DATA, tmp_path / "rig")
+    text = (folder / "rig.toml").read_text(encoding="utf-8")
+    lines = 'file = "free_vibration_1.csv"\nstart = { value = 0.05, unit = "s" }\nstop = { value = 0.2, unit = "s" }'
+    (folder / "rig.toml").write_text(text.replace('file = "free_vibration_1.csv"', lines), encoding="utf-8")
+    written = read_rig(folder).tables[0]
+    cut = rig.cut("free_vibration_1", 0.05).cut("free_vibration_1", stop=0.2)
+    assert cut.tables[0].settings == written.settings
+    np.testing.assert_array_equal(decay_window(cut.tables[0])[0], decay_window(written)[0])
+    assert cut.tables[1:] == rig.tables[1:]
+    whole = next(one for one in rig.tables if one.label == "run_1")
+    middle = 0.5 * (whole["time"][0] + whole["time"][-1])
+    run = next(one for one in rig.cut("run_1", stop=middle).tables if one.label == "run_1")
+    count = int(np.sum(whole["time"] <= middle))
+    for name in whole.columns:
+        np.testing.assert_array_equal(run[name], whole[name][:count])
+        assert not run[name].flags.writeable
+    np.testing.assert_array_equal(run.rows, whole.rows[:count])
+
+
+def test_a_stated_first_state_does_not_outlive_the_first_sample() -> None:
+    rig = read_rig(DATA)
+    label, (place, run) = "run_1", next((i, one) for i, one in enumerate(rig.tables) if one.label == "run_1")
+    for word, kept in (("stuck", "auto"), ("moving", "auto"), ("settled", "settled")):
+        settings = dataclasses.replace(run.settings, start=word)
+        tables = [*rig.tables[:place], dataclasses.replace(run, settings=settings), *rig.tables[place + 1 :]]
+        stated = dataclasses.replace(rig, tables=tuple(tables))
+        first, last = run["time"][5], run["time"][-5]
+        assert stated.cut(label, start=first).tables[place].settings.start == kept
+        assert stated.cut(label, stop=last).tables[place].settings.start == word
+
+
+def test_what_cannot_be_cut_says_what_can() -> None:
+    rig = read_rig(DATA)
+    labels = ", ".join(table.label for table in rig.tables)
+    for change in (rig.without, rig.cut):
+        with pytest.raises(InputError) as error:
+            change("run_9")
+        assert str(error.value).endswith(f"'run_9', choose from {labels}")
+    with pytest.raises(InputError, match="motor_current has no column time, choose from free_vibration_1, "):
+        rig.cut("motor_current", stop=1.0)
+    with pytest.raises(InputError, match=r"at least 8 samples must lie .* 0 samples of run_1, choose times between 0"):
+        rig.cut("run_1", start=1e3)
+    with pytest.raises(InputError, match="0 samples of free_vibration_1"):
+        rig.cut("free_vibration_1", stop=0.1).cut("free_vibration_1", start=0.2)

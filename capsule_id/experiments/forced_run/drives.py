@@ -328,7 +328,7 @@ def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
         ends = np.array([y.min(), y.max()])
         curves.append(Curve("support spring", np.array([gap, gap]), ends, role="paper"))
     label, points = f"{run.label}_phase_portrait", Points("record, Savitzky–Golay", recorded[0] * unit, recorded[1])
-    axes = axis_label(column), "rate of x_rel [m/s]"
+    axes = axis_label(column), "rate of x_rel, m/s"
     return [Comparison("phase_portrait", label, f"{run.label}: phase portrait", *axes, (points,), tuple(curves))]
 
 
@@ -371,7 +371,7 @@ class OtherRun(CapsuleRun):
                     self.kind,
                     f"{self.label}_{channel.name}",
                     f"{self.label}: {SHOWN[channel.name]}",
-                    "time [s]",
+                    "time, s",
                     axis_label(column),
                     (Points(self.label, self.time, channel.values * unit),),
                     (Curve("this fit", self.time, fitted * unit, *limits),),

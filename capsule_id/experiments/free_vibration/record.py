@@ -306,7 +306,7 @@ class Decay(SurfaceExperiment):
                 self.kind,
                 self.label,
                 f"{self.label}: {self.title}",
-                "time [s]",
+                "time, s",
                 axis_label(self.column),
                 (Points(self.label, time, self.values * unit),),
                 (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),

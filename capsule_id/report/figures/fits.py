@@ -38,7 +38,7 @@ from capsule_id.report.figures.style import (
     set_text,
 )
 from capsule_id.rig.model import Table
-from capsule_id.views import Comparison, Curve, Finding, Points
+from capsule_id.views import Comparison, Curve, Finding, Points, with_unit
 
 # comparisons: Measured beside predicted: the panels of a ``Comparison``, and where the point fit's starts ended.
 
@@ -85,7 +85,7 @@ def residuals(item: Comparison, ax: Axes) -> None:
     many = item.residuals.size > _MANY
     _about_zero(ax, QUANTILE_975, 1.1 * max(3.0, _largest(item.residuals)))
     ax.plot(item.points[0].x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
-    set_text(ax, item.x_label, "residual / sd [1]")
+    set_text(ax, item.x_label, "residual / sd")
 
 
 def autocorrelation(item: Comparison, ax: Axes) -> None:
@@ -102,7 +102,7 @@ def autocorrelation(item: Comparison, ax: Axes) -> None:
     limit = 1.25 * max(_largest(item.autocorrelation), 2.0 * bound, 0.05)
     _about_zero(ax, bound, limit, "95 % of white records")
     ax.vlines(np.arange(1, item.autocorrelation.size + 1), 0.0, item.autocorrelation, color=BLACK, lw=1.3)
-    set_text(ax, "lag [samples]", "autocorrelation [1]")
+    set_text(ax, "lag, samples", "autocorrelation")
     set_legend(ax, "above")  # bars of a coloured record reach everywhere
 
 
@@ -166,7 +166,7 @@ def point_fit_starts(fit: PointFit, ax: Axes) -> None:
     ax.axvline(0.0, color=GREY, lw=0.8, zorder=0)
     ax.set_yticks(rows, [plain_symbol(name) for name in fit.names], parse_math=False)
     ax.set_ylim(-0.8, len(rows) - 0.2)
-    set_text(ax, "distance from the best maximum [posterior sd]", "", "Starts of the point fit")
+    set_text(ax, "distance from the best maximum, posterior sd", "", "Starts of the point fit")
     set_legend(ax, "above")
 
 
@@ -247,7 +247,7 @@ def channel_with_findings(table: Table[Any], name: str, findings: Sequence[Findi
         named = [found.facts for found in findings if found.code == code and found.facts.get("column", name) == name]
         if rows := [row for facts in named for row in facts["rows"]]:
             ax.plot(x[rows], y[rows], ls="none", marker=marker, ms=5.0, color=color, label=words, zorder=3)
-    set_text(ax, *(f"{key}, {table.columns[key].unit}" if key else "row" for key in (across, name)))
+    set_text(ax, *(with_unit(key, table.columns[key].unit) if key else "row" for key in (across, name)))
     set_legend(ax, "above")
 
 
@@ -397,7 +397,11 @@ def corner(columns: SampledParameters, figure: Figure | SubFigure) -> None:
         for axis, k, shown in ((ax.xaxis, j, i == n - 1), (ax.yaxis, i, j == 0 < i)):
             if shown:
                 axis.set_major_locator(MaxNLocator(4, prune="both"))
-                axis.set_label_text(f"{columns.symbols[k]}\n[{columns.units[k]}]", fontsize=TEXT, parse_math=False)
+                axis.set_label_text(
+                    with_unit(columns.symbols[k], columns.units[k]).replace(", ", ",\n"),
+                    fontsize=TEXT,
+                    parse_math=False,
+                )
         ax.tick_params(labelsize=SMALL - 0.5, length=3)
         ax.tick_params("x", labelrotation=40)
         ax.ticklabel_format(useOffset=False, style="plain")
@@ -460,7 +464,7 @@ def traces(columns: SampledParameters, figure: Figure | SubFigure) -> None:
         for e, ensemble in enumerate(shown[..., i]):
             panel.plot(step, ensemble, color=CYCLE[e % len(CYCLE)], lw=0.6, alpha=0.8)
         lowest = i + 2 >= n  # of its column; over an empty place too
-        words = "step after burn-in [1]" if lowest else "", f"{columns.symbols[i]} [{columns.units[i]}]"
+        words = "step after burn-in" if lowest else "", with_unit(columns.symbols[i], columns.units[i])
         set_text(panel, *words, size=SMALL)
         panel.tick_params(labelbottom=lowest)
         panel.yaxis.set_major_locator(MaxNLocator(3))

@@ -240,7 +240,7 @@ def probabilities(data: xr.Dataset, ax: Axes) -> None:
     for area, (_, hatch) in zip(areas, looks.values(), strict=True):
         area.set_hatch(hatch)
     ax.set(xlim=(x.min(), x.max()), ylim=(0.0, 1.0))
-    set_text(ax, _axis_label(data, over), "probability of the motion, 1")
+    set_text(ax, _axis_label(data, over), "probability of the motion")
     set_legend(ax, "beside", areas[::-1], fontsize=SMALL - 1.0)
 
 
