@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import arviz
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -23,7 +24,7 @@ from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import BLOCKS
 from capsule_id.inference.result import Pointwise, Posterior
-from capsule_id.report.write import _digest, parameters_json
+from capsule_id.report.write import _digest, data_tree, netcdf_bytes, parameters_json
 from capsule_id.synthetic import truth_beside
 from capsule_id.views import Finding, Level
 from tests.cli_tools import DATA, listing, small_rig
@@ -192,6 +193,24 @@ def test_plots_of_absent_data_say_what_is_there(fitted: Fit) -> None:
         fitted.plot_record()
     with pytest.raises(InputError, match="choose from motor_current, support_spring_soft"):
         fitted.plot_comparison("pushes")
+
+
+def test_the_stored_sample_is_small(capsule: Fit, tmp_path: Path) -> None:
+    """Densities and replicates are rounded to steps far below what they vary by; arrays are packed."""
+    pointwise = cast(Pointwise, capsule.pointwise)
+    for label, density in pointwise.log_likelihood.items():
+        finite = density[np.isfinite(density)]
+        np.testing.assert_array_equal(finite * 2.0**16, np.round(finite * 2.0**16))
+        made = pointwise.replicates[label]
+        sd = np.std(made, axis=(0, 1))
+        made, sd = made[..., sd > 0.0], sd[sd > 0.0]
+        step = np.exp2(np.floor(np.log2(sd)) - 5.0)  # rounding may have moved the sd over a power of two
+        np.testing.assert_array_equal(made / step * 4.0, np.round(made / step * 4.0))
+        assert not np.array_equal(made / step * 0.25, np.round(made / step * 0.25))
+    (tmp_path / "x.nc").write_bytes(netcdf_bytes(data_tree(capsule)))
+    with h5py.File(tmp_path / "x.nc") as file:
+        for place in ("posterior/k1", "log_likelihood/readings", "posterior_predictive/y1_free_vibration_1"):
+            assert cast(h5py.Dataset, file[place]).compression == "gzip", place
 
 
 def test_a_parameter_by_its_name_has_the_numbers_of_the_files(capsule: Fit) -> None:

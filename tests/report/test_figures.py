@@ -20,7 +20,7 @@ from capsule_id.report.html import Picture, pictures
 from capsule_id.views import Comparison
 
 #: ``name, unit``; a name alone has no unit.
-UNIT = re.compile(r",\s(posterior )?\S+$|^(autocorrelation|residual / sd|friction coefficient|step after burn-in|μ)$")
+UNIT = re.compile(r",\s[^,]+$|^(autocorrelation|residual / sd|friction coefficient|step after burn-in|μ)$")
 
 
 def _named(result: Result, label: str) -> Comparison:

@@ -194,7 +194,7 @@ def test_few_figures_are_open_at_first(result: Result, drawn: tuple[Picture, ...
 def test_alternative_texts_say_what_is_seen(drawn: tuple[Picture, ...]) -> None:
     alts = {picture.name: picture.alt for picture in drawn}
     assert re.search(
-        r"8 readings from 0\.1 to 2; curves: this fit; \d+% of the residuals within", alts["motor_current"]
+        r"8 readings from 0\.1 to 2; curves: this fit; \d+ % of the residuals within", alts["motor_current"]
     )
     assert "strongest correlation" in alts["corner"]
     assert all(len(alt) > 30 for alt in alts.values())
