@@ -218,7 +218,8 @@ class Experiment(eqx.Module):
 
     def unstated_errors(self, symbol: str) -> set[str]:
         """Of the errors ``INSTRUMENT_WORDS``, those that move the parameter ``symbol`` and that rig.toml does not state."""
-        stated = self.table.drift != NO_DRIFT or _logger(self.table) or "time" not in self.table.columns
+        drift = self.table.drift != NO_DRIFT and not _counted(self.table)
+        stated = drift or _logger(self.table) or "time" not in self.table.columns
         return set() if stated else {"clock"}
 
     @property
@@ -405,7 +406,7 @@ def clock_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
     stated = table.drift
     if stated.sd == 0.0:
         return ()
-    logger = _logger(table)
+    logger = _logger(table) or (table.label if _counted(table) else "")
     same = (other.label for other in rig.tables if other.drift == stated and not _logger(other))
     return (parameter("clock_drift", logger or next(same, table.label), Prior("normal", stated.value, stated.sd)),)
 
@@ -414,6 +415,11 @@ def _logger(table: Table[Any]) -> str:
     """Name of the instrument that read the times; "" where it is not stated."""
     instrument = table.columns["time"].instrument if "time" in table.columns else None
     return "" if instrument is None else instrument.name
+
+
+def _counted(table: Table[Any]) -> bool:
+    """Whether the rate of a record was found from the ticks of its clock: an error of its own, beside that of the clock."""
+    return any(found.code == "times.ticks" for found in table.findings)
 
 
 def stated_rate(table: Table[Any]) -> float | None:

@@ -11,7 +11,7 @@ import xlsxwriter
 import capsule_id
 from capsule_id import cli
 from capsule_id.errors import InputError
-from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.lint import lint
 from capsule_id.rig.formats.text import is_stamp, seconds_of_stamps
 from capsule_id.rig.model import Rig
@@ -207,6 +207,17 @@ def test_the_rate_of_counts_is_uncertain_in_the_fit(tmp_path: Path) -> None:
     assert table.drift.sd == found.facts["sd"] > 0.0
     assert abs(np.mean(np.diff(table["time"])) / 1e-3 - 1.0) <= 1.8 * table.drift.sd
     assert "rounded to 0.0156 s" in default_messages(found)
+
+
+def test_the_rate_of_counts_is_no_statement_about_the_clock(tmp_path: Path) -> None:
+    """Two records of equal stamps: an error of the rate each, and the clock's own error is in no sd."""
+    rig = rig_of(tmp_path, np.tile(np.floor(TIME / 0.0156 + 1e-9) * 0.0156, 2), np.tile(DISP, 2))
+    made = make_experiments(rig, "all", default_registry())
+    assert [row.name for e in made for row in e.parameters if row.symbol == "clock_drift"] == [
+        "clock_drift[d_1]",
+        "clock_drift[d_2]",
+    ]
+    assert {word for e in made for word in e.unstated_errors("k1")} == {"clock"}
 
 
 def default_messages(found: Finding) -> str:
