@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         If the folder is not a valid rig, or DIR cannot be written.
     """
     kinds = default_registry()
-    rig = read_rig(*rig_folders([args.data] if args.data is not None else []), kinds)
+    rig = read_rig(rig_folders([args.data] if args.data is not None else [])[0], kinds)
     lines = [f"{rig.name}: {counted(len(rig.tables), 'experiment')}{', SYNTHETIC data' if rig.synthetic else ''}"]
     lines += [_summary(table) for table in rig.tables]
     lines += [f"{table.label}: {line}" for table in rig.tables for line in kinds[table.kind].describe(table)]

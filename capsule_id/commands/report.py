@@ -98,8 +98,8 @@ def _side_by_side(names: Sequence[str], results: Sequence[_Saved]) -> str:
     first, lines = {*results[0].files.values()}, []
     for letter, name, result in zip(string.ascii_uppercase, names, results, strict=False):
         same = [file for file, own in result.files.items() if own in first and letter != "A"]
-        shared = f"; it shares {', '.join(same)} with A, so that the differences in sd are too small" if same else ""
-        lines.append(f"{letter}: {name}: {result.verdict}{shared}")
+        shared = f"; it shares {counted(len(same), 'file')} with A, so that its differences in sd are too small"
+        lines.append(f"{letter}: {name}: {result.verdict}{shared if same else ''}")
     return "\n".join([table_side_by_side([result.summary for result in results]), *wrapped(lines)])
 
 

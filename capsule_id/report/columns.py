@@ -392,10 +392,12 @@ def table_side_by_side(summaries: Sequence[pd.DataFrame]) -> str:
         own = [rows.get(name) for rows in results]
         words = ["" if row is None or row.values["trust"] == "trusted" else f" ({row.values['trust']})" for row in own]
         values = [row.quoted + word if row else MISSING for row, word in zip(own, words, strict=True)]
-        sds = [float(frame["sds"].get(name, math.nan)) for frame in compared]
+        sds = [float(frame["sds"].to_dict().get(name, math.nan)) for frame in compared]
         unit = next(row.unit for row in own if row)
         table.append([name, unit, *values, *(MISSING if math.isnan(x) else f"{x:+.1f}" for x in sds)])
-    differing = [", ".join(str(name) for name, differs in frame["differs"].items() if differs) for frame in compared]
+    differing = [
+        ", ".join(str(name) for name, differs in frame["differs"].to_dict().items() if differs) for frame in compared
+    ]
     texts = [
         f"{letter} differs from A in {names or 'no parameter that both have'}"
         for letter, names in zip(letters[1:], differing, strict=True)

@@ -192,7 +192,7 @@ def test_report_puts_results_side_by_side(tmp_path: Path, capsys: pytest.Capture
     assert rest[:2] == ["B differs from A in mu", "C differs from A in no parameter that both have"]
     assert "shares" not in "".join(rest)
     capsule_id(["report", str(folders[0]), str(folders[0])])
-    assert "it shares rig.toml, static_friction.csv with A" in " ".join(capsys.readouterr().out.split())
+    assert "it shares 2 files with A" in " ".join(capsys.readouterr().out.split())
     assert "--json is for one result" in refused(capsys, "report", "a", "b", "--json", program="capsule_id")
     assert "run fit-params first" in refused(capsys, "report", str(folders[0]), "b", program="capsule_id")
 
