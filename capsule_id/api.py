@@ -1,5 +1,6 @@
 """What the commands do, as functions, and the finished fit that they return."""
 
+import json
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -34,7 +35,7 @@ from capsule_id.inference.prediction import DRAWS, predict, random_draws
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
-from capsule_id.output import check_directory, publish, work_in_progress
+from capsule_id.output import check_directory, publish, replace_file, work_in_progress
 from capsule_id.parameters import by_index, is_stated, symbol_of
 from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
 from capsule_id.physics.model import CapsuleParameters, Drive, Trajectory
@@ -53,7 +54,7 @@ from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import subfigure_at
 from capsule_id.report.html import summary_html
 from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
-from capsule_id.report.write import data_tree, load_fields, result_files, table_frame, write_result
+from capsule_id.report.write import data_tree, load_fields, model_json, result_files, table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding, Level, ResultTable, Trust, after_number
@@ -313,6 +314,20 @@ class Fit(Result):
     def plot_starts(self, ax: Axes | None = None) -> Axes:
         """Where each start of the point fit began and ended, in standard deviations."""
         return _drawn(figures.point_fit_starts, self.point_fit, ax, *figures.starts_size(self.point_fit))
+
+    def export(self, file: str | Path, draws: int = 1000, seed: int = 0) -> None:
+        """Write the calibrated model as JSON, for other programs: values, covariance and draws of the parameters, SI.
+
+        ``capsule_id/report/templates/model.schema.json`` describes the file. As in ``posterior.nc``, draws do not contain
+        the ``widening`` of the sds, which the covariance contains.
+
+        Raises
+        ------
+        InputError
+            If nothing was sampled, or there are fewer draws.
+        """
+        chosen = random_draws(self, draws, np.random.default_rng(seed))
+        replace_file(Path(file), json.dumps(model_json(self, chosen), allow_nan=False) + "\n")
 
     def write(self, directory: str | Path) -> None:
         """Write parameters.json, parameters.csv, posterior.nc, report.html and figures/ into ``directory``.

@@ -1,6 +1,7 @@
 """The object that ``fit`` and ``load`` return: words, tables, plots, draws, files."""
 
 import dataclasses
+import json
 import os
 import re
 import shutil
@@ -27,7 +28,7 @@ from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.report.write import _digest, data_tree, netcdf_bytes, parameters_json
 from capsule_id.synthetic import truth_beside
 from capsule_id.views import Finding, Level
-from tests.cli_tools import DATA, listing, small_rig
+from tests.cli_tools import DATA, ROOT, listing, small_rig
 
 TABLES = ("free_vibration_1", "static_friction", "dynamic_friction", "support_spring_soft")
 TIMES = np.linspace(0.0, 0.3, 40)
@@ -193,6 +194,31 @@ def test_plots_of_absent_data_say_what_is_there(fitted: Fit) -> None:
         fitted.plot_record()
     with pytest.raises(InputError, match="choose from motor_current, support_spring_soft"):
         fitted.plot_comparison("pushes")
+
+
+def test_the_calibrated_model_as_json(capsule: Fit, tmp_path: Path) -> None:
+    """It keeps to its schema; values, covariance and draws are those of the result, widened sds too."""
+    summary = capsule.summary.copy()
+    summary.loc["k1", ["sd", "widening"]] = [2.0 * float(summary.at["k1", "sd"]), 2.0]
+    wide = dataclasses.replace(capsule, summary=summary)
+    wide.export(tmp_path / "model.json", draws=50, seed=3)
+    saved = json.loads((tmp_path / "model.json").read_text(encoding="utf-8"))
+    schema = json.loads((ROOT / "capsule_id/report/templates/model.schema.json").read_text(encoding="utf-8"))
+    jsonschema = pytest.importorskip("jsonschema")
+    jsonschema.validate(saved, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**saved, "parameters": [{**saved["parameters"][0], "sd": "3"}]}, schema)
+    names, draws = [one["name"] for one in saved["parameters"]], np.array(saved["draws"])
+    posterior = cast(Posterior, capsule.posterior)
+    assert draws.shape == (50, len(names))
+    flat = posterior.draws[..., [posterior.names.index(name) for name in names]].reshape(-1, len(names))
+    assert {tuple(row) for row in draws} <= {tuple(row) for row in flat.tolist()}
+    covariance = np.array(saved["covariance"])
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [wide[name].sd for name in names], rtol=1e-12)
+    assert [one["value"] for one in saved["parameters"]] == [wide[name].value for name in names]
+    factors = np.where(np.array(names) == "k1", 2.0, 1.0)
+    np.testing.assert_allclose(covariance / np.outer(factors, factors), np.cov(flat.T), rtol=1e-9)
+    assert saved["fixed"]["g"] == 9.81
 
 
 def test_the_stored_sample_is_small(capsule: Fit, tmp_path: Path) -> None:

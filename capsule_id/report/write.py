@@ -109,6 +109,33 @@ def parameters_json(result: Result) -> dict[str, object]:
     }
 
 
+def model_json(result: Result, draws: Mapping[str, np.ndarray]) -> dict[str, object]:
+    """The calibrated model, ready for strict JSON, SI: sampled physical parameters, their covariance, ``draws`` of them.
+
+    ``templates/model.schema.json`` describes it. The covariance has the correlations of the sample and the quoted sds.
+    """
+    posterior: Any = result.posterior
+    names = [str(name) for name in result.summary.index if name in posterior.names]
+    own = result.summary.loc[names]
+    columns = np.stack([posterior.draws[..., posterior.names.index(name)].ravel() for name in names])
+    sd = own["sd"].to_numpy(float)
+    content = {
+        "format": "capsule-id model 1",
+        "rig": result.rig.name,
+        "synthetic": result.rig.synthetic,
+        "trust": result.trust,
+        "model": asdict(result.rig.model) | {"friction_law": result.provenance.friction},
+        "parameters": [
+            {"name": name, **{key: own.at[name, key] for key in ("unit", "value", "sd", "trust", "widening")}}
+            for name in names
+        ],
+        "fixed": {**result.fixed, "g": result.rig.g.value},
+        "covariance": np.atleast_2d(np.corrcoef(columns)) * np.outer(sd, sd),
+        "draws": np.column_stack([draws[name] for name in names]),
+    }
+    return {key: _plain(value) for key, value in content.items()}
+
+
 def table_frame(result: Result) -> pd.DataFrame:
     """Physical parameters and nuisances in one table, SI; ``role`` separates them, every row says ``synthetic``."""
     table = pd.concat([part for part in (result.summary, result.nuisances) if len(part)]).rename_axis("name")

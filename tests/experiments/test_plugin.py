@@ -295,7 +295,7 @@ def test_a_table_with_one_column_is_a_test_too() -> None:
     expected = np.sum(stats.norm.logpdf(force, 1.42, np.hypot(0.02, 0.03)))
     assert float(e.log_likelihood(theta, np)) == pytest.approx(expected, rel=1e-12)
     (panel,) = e.comparisons(theta, [])
-    assert (panel.x_label, panel.y_label) == ("trial [1]", "force [SI]")
+    assert (panel.x_label, panel.y_label) == ("trial", "force, SI")
     assert panel.points[0].x.tolist() == [1.0, 2.0, 3.0]
 
 
