@@ -180,6 +180,8 @@ def _step(
 
 def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bool:
     """Whether the residuals (n,) projected on the range of J (n, d) are small against the rest or ``rounding``."""
+    if not np.isfinite(jacobian).all():
+        return False
     left = column_space(jacobian)[0]
     tangential = float(np.linalg.norm(left.T @ residuals))
     normal = float(np.linalg.norm(residuals - left @ (left.T @ residuals)))

@@ -232,7 +232,8 @@ def test_a_random_decay_ends_with_a_verdict_or_is_refused(tmp_path: Path, seed: 
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    "seed", [1021, *(pytest.param(s, marks=pytest.mark.slow) for s in (1039, 1057, 1071, 1076, 1078, 1083, 1113, 1123))]
+    "seed",
+    [1021, *(pytest.param(s, marks=pytest.mark.slow) for s in (1039, 1057, 1071, 1076, 1078, 1083, 1113, 1123, 1131))],
 )
 def test_a_random_decay_is_sampled_to_its_verdict(tmp_path: Path, seed: int) -> None:
     """Three readings left for the paper's estimate, and readings without noise (before: a warning, an internal failure).

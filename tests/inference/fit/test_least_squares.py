@@ -126,6 +126,12 @@ def test_a_start_without_finite_residuals_is_reported_and_the_others_go_on() -> 
     np.testing.assert_allclose(fit.x[1], 3.0, rtol=1e-8)
 
 
+def test_an_end_without_a_finite_derivative_is_no_minimum() -> None:
+    """The derivative of the root of a square at 0. (Before: a singular value decomposition that did not converge.)"""
+    result = solve(lambda x: jnp.sqrt((x - jnp.array([0.0, 1.0])) ** 2), np.array([[0.0, 3.0]]))
+    assert result.stalled.all()
+
+
 def test_a_step_to_where_the_residuals_are_not_finite_is_taken_back() -> None:
     # The first undamped step from 10 leads to 10 − 10 ln 1000 < 0, where the logarithm is not a number.
     fit = solve(lambda b: jnp.log(b) - jnp.log(0.01) * jnp.ones(3), np.array([[10.0]]))
