@@ -356,23 +356,33 @@ def read_tables(
     stamps: tuple[Finding, ...] = ()
     if column_map is not None and any(source.unit == STAMP for source in column_map.sources.values()):
         stamps = (Finding("times.stamps", "ok", {"file": nodes[0].value, "rows": len(raw.rows)}),)
+    tables = _records(entry, kind, label, settings, raw, plateaus, stamps)
+    return [(replace(table, encodings=encodings), written) for table, written in tables], hashes
+
+
+def _records(
+    entry: Node,
+    kind: KindRule,
+    label: str,
+    settings: Settings,
+    raw: RawTable,
+    plateaus: Plateaus | None,
+    findings: tuple[Finding, ...],
+) -> list[tuple[Table, RawTable]]:
+    """The tables of the records in ``raw``; the first one has ``findings`` on the file."""
+    nodes, tables = _file_nodes(entry), []
     increasing = "time" in raw.names and "time" in kind.columns and plateaus is None and len(nodes) == 1
     records = records_of(raw, nodes[0].value) if increasing else [Record(raw)]
     labels = [label] if len(records) == 1 else [f"{label}_{k + 1}" for k in range(len(records))]
-    tables = []
     for own, record in zip(labels, records, strict=True):
         one, drift = record.raw, record.drift
         if (clock := clock_of(entry)) is not None:
             one, stated = on_reference(clock, one)
             drift = replace(stated, sd=float(np.hypot(stated.sd, drift.sd)))
-        tables.append(_table(entry, kind, own, settings, one, plateaus, drift))
-        findings = (*stamps, *record.findings)
-        tables[-1] = (
-            replace(tables[-1][0], file=nodes[0].value, encodings=encodings, findings=findings),
-            tables[-1][1],
-        )
-        stamps = ()
-    return tables, hashes
+        table, written = _table(entry, kind, own, settings, one, plateaus, drift)
+        tables.append((replace(table, file=nodes[0].value, findings=(*findings, *record.findings)), written))
+        findings = ()
+    return tables
 
 
 def _table(
