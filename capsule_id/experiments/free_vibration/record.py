@@ -177,8 +177,8 @@ UNIFORM = 0.6
 LATEST_TURNING_POINT = 0.1
 #: A rough viscous fit whose residuals are this many times the noise misses a force.
 MISFIT = 3.0
-#: Smallest sd of a reading that is not stated, relative to ``width``: that of steps of 18 bits, which good converters
-#: resolve. Readings without noise would determine k1/m1 to more digits than covariances and sums of squares hold.
+#: Smallest sd of a reading with white noise, where none is stated, relative to ``width``: that of steps of 18 bits, which
+#: good converters resolve. Without noise k1/m1 would have more digits than covariances and sums of squares hold.
 FINEST = 2.0**-18 / np.sqrt(12.0) / NUISANCE_WIDTH
 
 
@@ -467,7 +467,7 @@ class DecayRecord(Decay):
             return (Misfit(raw, (self.reading_sd * self.relative_sd) ** 2, self.relative_sd, design),)
         columns = xp.concatenate([xp.reshape(raw, (-1, 1)), design], axis=1)
         white = xp.asarray(whiten(self.times, columns, self.model, theta))
-        return (Misfit(white[:, 0], (FINEST * self.width) ** 2, 1.0, white[:, 1:]),)
+        return (Misfit(white[:, 0], 0.0, 1.0, white[:, 1:]),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         if not self.folded.size or xp is np:
