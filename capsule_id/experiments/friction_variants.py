@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from capsule_id.experiments.base import LEVEL, Fitted, of_neighbours, permutation_p
+from capsule_id.experiments.base import LEVEL, Fitted
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI
+from capsule_id.experiments.statistics import of_neighbours, permutation_p
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior
 from capsule_id.physics.forces import CoulombStribeck
 from capsule_id.views import Finding

@@ -369,7 +369,10 @@ def _records(
     plateaus: Plateaus | None,
     findings: tuple[Finding, ...],
 ) -> list[tuple[Table, RawTable]]:
-    """The tables of the records in ``raw``; the first one has ``findings`` on the file."""
+    """The tables of the records in ``raw``, SI, without outliers, and each as written, without its numbers.
+
+    The first one has ``findings`` on the file.
+    """
     nodes, tables = _file_nodes(entry), []
     increasing = "time" in raw.names and "time" in kind.columns and plateaus is None and len(nodes) == 1
     records = records_of(raw, nodes[0].value) if increasing else [Record(raw)]
@@ -379,31 +382,17 @@ def _records(
         if (clock := clock_of(entry)) is not None:
             one, stated = on_reference(clock, one)
             drift = replace(stated, sd=float(np.hypot(stated.sd, drift.sd)))
-        table, written = _table(entry, kind, own, settings, one, plateaus, drift)
-        tables.append((replace(table, file=nodes[0].value, findings=(*findings, *record.findings)), written))
+        if "reject" in entry:
+            one = without_outliers(entry["reject"], one, _times)
+        if plateaus is not None:
+            one = readings_of_plateaus(entry["plateaus"], one, _times(one), plateaus)
+        one.rows.flags.writeable = False
+        columns = {column: _to_si(one, index, kind.columns[column]) for index, column in enumerate(one.names)}
+        dropped = one.lost, one.other, one.rejected
+        table = Table(kind.name, own, nodes[0].value, columns, settings, one.rows, kind.bench, *dropped, drift=drift)
+        tables.append((replace(table, findings=(*findings, *record.findings)), replace(one, columns=())))
         findings = ()
     return tables
-
-
-def _table(
-    entry: Node,
-    kind: KindRule,
-    label: str,
-    settings: Settings,
-    raw: RawTable,
-    plateaus: Plateaus | None,
-    drift: Quantity,
-) -> tuple[Table, RawTable]:
-    """One table of an experiment in SI, without outliers, and as written, without its numbers."""
-    if "reject" in entry:
-        raw = without_outliers(entry["reject"], raw, _times)
-    if plateaus is not None:
-        raw = readings_of_plateaus(entry["plateaus"], raw, _times(raw), plateaus)
-    raw.rows.flags.writeable = False
-    columns = {column: _to_si(raw, index, kind.columns[column]) for index, column in enumerate(raw.names)}
-    dropped = raw.lost, raw.other, raw.rejected
-    table = Table(kind.name, label, "", columns, settings, raw.rows, kind.bench, *dropped, drift=drift)
-    return table, replace(raw, columns=())
 
 
 def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]:

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.experiments.base import autocorrelation, ljung_box
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.models import fold
+from capsule_id.experiments.statistics import autocorrelation, ljung_box
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.precision import COMPILE_QUICKLY

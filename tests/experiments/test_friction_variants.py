@@ -10,11 +10,12 @@ from scipy import stats
 
 import capsule_id as cid
 from capsule_id.experiments import friction_variants
-from capsule_id.experiments.base import LEVEL, of_neighbours, permutation_p
+from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.friction import FrictionExperiment, paper_friction_fit
 from capsule_id.experiments.friction_model import FrictionModel, model_lines
 from capsule_id.experiments.friction_variants import PARTICLES, PERMUTATIONS, VariantPoints, check_variants, fit_variant
 from capsule_id.experiments.kind import make_experiments
+from capsule_id.experiments.statistics import of_neighbours, permutation_p
 from capsule_id.physics.forces import CoulombStribeck
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding

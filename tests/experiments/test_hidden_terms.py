@@ -16,13 +16,14 @@ from scipy.optimize import least_squares
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.experiments.base import further_columns, refit
+from capsule_id.experiments.base import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.hidden_terms import Hidden, check_hidden_terms, force_responses, hidden_terms
 from capsule_id.experiments.free_vibration.lint import MESSAGES
 from capsule_id.experiments.free_vibration.record import Screened
 from capsule_id.experiments.free_vibration.second_fit import open_models, second_models
 from capsule_id.experiments.kind import make_experiments
+from capsule_id.experiments.statistics import further_columns
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.rig.model import Quantity, Rig, Table

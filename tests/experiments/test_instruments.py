@@ -9,8 +9,8 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import basis_of
 from capsule_id.experiments.kind import make_experiments
+from capsule_id.experiments.statistics import basis_of
 from capsule_id.inference.checks.settings import design, outliers
 from capsule_id.inference.checks.verdict import has_own_nuisances
 from tests.rig.folder import write_folder

@@ -32,10 +32,8 @@ def rig_of(folder: Path, rows: dict[int, str], lines: str = "", header: str = "t
     return capsule_id.read_rig(folder)
 
 
-def finding_of(rig: Rig, code: str = "readings.missing") -> Finding | None:
-    findings = [found for found in lint(rig, default_registry(), rig.tables) if found.code == code]
-    assert len(findings) <= 1
-    return findings[0] if findings else None
+def findings_of(rig: Rig, code: str = "readings.missing") -> list[Finding]:
+    return [found for found in lint(rig, default_registry(), rig.tables) if found.code == code]
 
 
 MAP = 'columns = { time = { from = "t", unit = "s" }, x_rel = { from = "x", unit = "mm" } }'
@@ -50,11 +48,10 @@ def test_missing_cells_are_counted(tmp_path: Path, text: str, header: str, lines
     np.testing.assert_array_equal(table.rows, np.delete(np.arange(2, 1002), [500, 700, 701]))
     np.testing.assert_allclose(table["time"], np.delete(TIME, [500, 700, 701]), rtol=1e-12)
     assert (table.missing, table.lost.tolist()) == (3, [502, 702, 703])
-    found = finding_of(rig)
-    assert found is not None
+    (found,) = findings_of(rig)
     assert (found.level, found.facts["rows"], found.facts["near"]) == ("ok", 3, 0)
     # They are no gap of the clock, nor rounded times.
-    assert finding_of(rig, "readings.gaps") is finding_of(rig, "readings.rounded_times") is None
+    assert findings_of(rig, "readings.gaps") == findings_of(rig, "readings.rounded_times") == []
 
 
 @pytest.mark.parametrize("text", ["inf", "over", "n.a. 3", "NaN0"])
@@ -76,15 +73,13 @@ def test_any_other_text_is_an_error(tmp_path: Path, text: str) -> None:
     ],
 )
 def test_many_or_early_ones_are_a_warning(tmp_path: Path, rows: list[int], level: str, near: int) -> None:
-    found = finding_of(rig_of(tmp_path, dict.fromkeys(rows, "NaN")))
-    assert found is not None
+    (found,) = findings_of(rig_of(tmp_path, dict.fromkeys(rows, "NaN")))
     assert (found.level, found.facts["near"], found.facts["unjudged"]) == (level, near, level == "warn")
 
 
 def test_first_readings_may_be_the_release(tmp_path: Path) -> None:
     """A sensor beyond its range writes NaN at the release: the record seems to begin later."""
-    found = finding_of(rig_of(tmp_path, dict.fromkeys(range(130), "NaN")))
-    assert found is not None
+    (found,) = findings_of(rig_of(tmp_path, dict.fromkeys(range(130), "NaN")))
     assert (found.level, found.facts["near"]) == ("warn", 130)
 
 
@@ -108,8 +103,7 @@ def test_a_table_of_trials_counts_its_share(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("angle [deg]\n34.1\n33.8\n--\n34.4\n33.9\n", encoding="utf-8")
     entry = '[[experiment]]\nkind = "static_friction"\nfile = "t.csv"\n'
     (tmp_path / "rig.toml").write_text(f'[rig]\nname = "r"\n{entry}', encoding="utf-8")
-    found = finding_of(capsule_id.read_rig(tmp_path))
-    assert found is not None
+    (found,) = findings_of(capsule_id.read_rig(tmp_path))
     assert (found.level, found.facts["rows"], found.facts["used"]) == ("warn", 1, 4)
 
 

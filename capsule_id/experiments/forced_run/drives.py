@@ -12,25 +12,14 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import (
-    LEVEL,
-    Fitted,
-    Start,
-    ValuesBySymbol,
-    autocorrelation,
-    axis_label,
-    band,
-    further_columns,
-    judged,
-    stacked,
-    stretch,
-)
+from capsule_id.experiments.base import LEVEL, Fitted, Start, ValuesBySymbol, axis_label, band, stacked, stretch
 from capsule_id.experiments.capsule_experiment import lag_of
 from capsule_id.experiments.forced_run.declaration import FEWEST_SAMPLES, SETTLING_PERIODS
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
 from capsule_id.experiments.kind import Estimate
+from capsule_id.experiments.statistics import autocorrelation, further_columns, judged
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
 from capsule_id.physics.forces import FrictionLaw, downhill, grazing_load, rod_on_capsule
 from capsule_id.physics.model import (

@@ -10,15 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import (
-    Start,
-    ValuesBySymbol,
-    autocorrelation,
-    clock_parameters,
-    scatter_prior,
-    stated_rate,
-    stretch,
-)
+from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, scatter_prior, stated_rate, stretch
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters, stated_starts
 from capsule_id.experiments.forced_run.declaration import (
     CAPSULE_START,
@@ -41,6 +33,7 @@ from capsule_id.experiments.friction_model import (
     instrument_parameters,
 )
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
+from capsule_id.experiments.statistics import autocorrelation
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.forces import FrictionLaw, equilibrium
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory, rod_acceleration

@@ -9,16 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import (
-    LEVEL,
-    Check,
-    Fitted,
-    Start,
-    ValuesBySymbol,
-    further_columns,
-    refit,
-    weighted_mean,
-)
+from capsule_id.experiments.base import LEVEL, Check, Fitted, Start, ValuesBySymbol, refit
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
@@ -35,6 +26,7 @@ from capsule_id.experiments.free_vibration.second_fit import (
     nested_starts,
     second_models,
 )
+from capsule_id.experiments.statistics import further_columns, weighted_mean
 from capsule_id.parameters import parameter
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import sampling

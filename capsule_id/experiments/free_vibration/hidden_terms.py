@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lsim
 
-from capsule_id.experiments.base import Fitted, ValuesBySymbol, stretch, without
+from capsule_id.experiments.base import Fitted, ValuesBySymbol, stretch
 from capsule_id.experiments.free_vibration.decrement import STRONGEST, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
@@ -18,6 +18,7 @@ from capsule_id.experiments.free_vibration.readings import (
     natural_units,
 )
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord
+from capsule_id.experiments.statistics import without
 from capsule_id.parameters import QUANTILE_975, parameter
 from capsule_id.views import Facts, Finding, Level
 

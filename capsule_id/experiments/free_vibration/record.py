@@ -17,7 +17,6 @@ from tinygp.solvers.quasisep.core import DiagQSM, StrictLowerTriQSM, SymmQSM
 from capsule_id.experiments.base import (
     About,
     ValuesBySymbol,
-    autocorrelation,
     axis_label,
     band,
     clock_parameters,
@@ -68,6 +67,7 @@ from capsule_id.experiments.free_vibration.readings import (
 )
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
+from capsule_id.experiments.statistics import autocorrelation
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.release import shortened
 from capsule_id.records.tones import noise_level

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.experiments.base import LEVEL, Start, further_columns, ljung_box, refit, weighted_mean
+from capsule_id.experiments.base import LEVEL, Start, refit
 from capsule_id.experiments.free_vibration.decrement import REFINED, STRONGEST, UNKNOWNS, Decrement, viscous_fit
 from capsule_id.experiments.free_vibration.hidden_terms import SENSITIVITY_STEP, force_responses, sensitivities
 from capsule_id.experiments.free_vibration.models import (
@@ -36,6 +36,7 @@ from capsule_id.experiments.free_vibration.readings import (
 )
 from capsule_id.experiments.free_vibration.record import DecayRecord, ReadingTimes, Screened, whiten_by_shape
 from capsule_id.experiments.misfit import LOG_2PI
+from capsule_id.experiments.statistics import further_columns, ljung_box, weighted_mean
 from capsule_id.physics.batches import pool
 from capsule_id.physics.exact.engine import as_one_function
 from capsule_id.records.tones import noise_level

@@ -10,8 +10,9 @@ from scipy import stats
 from scipy.fft import dct
 from scipy.ndimage import gaussian_filter1d
 
-from capsule_id.experiments.base import LEVEL, TIE, Experiment, basis_of
+from capsule_id.experiments.base import LEVEL, Experiment
 from capsule_id.experiments.lint import wrong_prefix
+from capsule_id.experiments.statistics import TIE, basis_of
 from capsule_id.inference.checks.settings import SMALLEST_SCATTER, design
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.moves import geyer_size

@@ -6,18 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from capsule_id.experiments.base import (
-    Experiment,
-    ValuesBySymbol,
-    autocorrelation,
-    basis_of,
-    estimate,
-    judged,
-    of_neighbours,
-    permutation_p,
-    refit,
-)
+from capsule_id.experiments.base import Experiment, ValuesBySymbol, estimate, refit
 from capsule_id.experiments.friction import varies
+from capsule_id.experiments.statistics import autocorrelation, basis_of, judged, of_neighbours, permutation_p
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.point_stage import SampledFit

@@ -10,17 +10,9 @@ from jaxtyping import Float, Int
 from scipy import stats
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import (
-    LAGS,
-    LEVEL,
-    Experiment,
-    correlated_records,
-    estimate,
-    judged,
-    refit,
-    weighted_mean,
-)
+from capsule_id.experiments.base import LEVEL, Experiment, correlated_records, estimate, refit
 from capsule_id.experiments.friction_model import EQUATION_1
+from capsule_id.experiments.statistics import LAGS, judged, weighted_mean
 from capsule_id.inference.checks.posterior import (
     PRIOR_PULL,
     check_maximum,

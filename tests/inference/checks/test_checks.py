@@ -8,12 +8,12 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.api import read_rig
-from capsule_id.experiments.base import basis_of
 from capsule_id.experiments.free_vibration.declaration import DECAY_NOISE, RELEASES, decay
 from capsule_id.experiments.free_vibration.models import decay as rubbed_decay
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.point_test import Line, curvature_test
 from capsule_id.experiments.static_friction import tilts as tilted
+from capsule_id.experiments.statistics import basis_of
 from capsule_id.inference.checks.settings import outliers
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.point_fit import point_fit
