@@ -31,7 +31,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.kind import Choice, Registry, compare, select_tables
 from capsule_id.experiments.lint import lint
 from capsule_id.inference.checks.posterior import check_agreement, decisive_readings
-from capsule_id.inference.checks.verdict import beside_stated, record_widenings, run_checks, widenings, with_scaled
+from capsule_id.inference.checks.verdict import model_errors, run_checks, with_scaled
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.point_fit import point_fit_again
 from capsule_id.inference.point_stage import SampledFit
@@ -141,10 +141,14 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     checked = replace(
         checked, findings=(*checked.findings, *sampled.findings, *agreement, *check_engine(sampled), *before)
     )
-    widened = beside_stated(checked, {**widenings(checked), **record_widenings(checked)})
+    widened = model_errors(checked)
     findings = list(checked.findings)
     for lost in (False, True):
-        factors = [(name, one.factor, one.parts) for name, one in widened.items() if one.no_number == lost]
+        factors = [
+            (name, one.factor, one.parts)
+            for name, one in widened.items()
+            if one.no_number == lost and (lost or one.parts)
+        ]
         if factors:
             names = tuple(name for name, *_ in factors) if lost else ()
             findings.append(Finding("model.error", "fail" if lost else "warn", {"factors": factors}, parameters=names))

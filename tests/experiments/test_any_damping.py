@@ -138,17 +138,39 @@ def test_further_forces_of_a_rod_that_does_not_swing_are_refused(tmp_path: Path)
     check(folder(tmp_path / "viscous", time, x, m1, 'damping = "viscous"'))
 
 
-@pytest.mark.parametrize("ratio", [0.6, 1.0])
-def test_a_strongly_damped_decay_is_fitted(tmp_path: Path, ratio: float) -> None:
+VISCOUS_LINEAR = 'damping = "viscous"\nstiffness = "linear"'
+
+
+@pytest.mark.parametrize(("ratio", "words"), [(0.6, ""), (1.0, VISCOUS_LINEAR)])
+def test_a_strongly_damped_decay_is_fitted(tmp_path: Path, ratio: float, words: str) -> None:
     """(Before: k1 = 5.5 ± 6.0 for 987 with a clean verdict at 0.6, refused at 1.0.)"""
     time, x, k1, c, m1 = twin(ratio, 1)
-    result = cid.fit(cid.read_rig(folder(tmp_path, time, x, m1)), budget=None)
+    result = cid.fit(cid.read_rig(folder(tmp_path, time, x, m1, words)), budget=None)
     assert [f.code for f in result.findings if f.level == "fail"] == []
     for name, truth in (("k1", k1), ("c", c)):
         row = result.summary.loc[name]
         assert abs(float(row["value"]) - truth) < 3.0 * float(row["sd"])
         assert float(row["sd"]) < 0.1 * truth
     assert np.isnan(result.summary.loc["k1", "paper"])
+
+
+def test_the_interval_of_a_decay_that_does_not_swing_holds_forces_that_it_cannot_show(tmp_path: Path) -> None:
+    """A cubic spring at ratio 0.9, whose residuals are white. (Before: k1 38 % too large, 23 sd off, and trusted.)"""
+    time, _, k1, c, m1 = twin(0.9, 1)
+    forces = {"k1": k1, "c": c, "m1": m1, "k_cubic": 0.3 * k1}
+    x = 1e-3 * (scipy_decay(time, forces, 1.0, 0.0)[0] + 0.005 * np.random.default_rng(1).standard_normal(len(time)))
+    open_words = cid.fit(cid.read_rig(folder(tmp_path / "open", time, x, m1)), budget=None)
+    for name, truth in (("k1", k1), ("c", c)):
+        row = open_words.summary.loc[name]
+        assert abs(row["value"] - truth) < 2.0 * row["sd"]
+        assert row["sd"] > 5.0 * row["sd_unwidened"]
+        (found,) = (f for f in open_words.findings if f.code == "decays.hidden" and f.facts["name"] == name)
+        assert found.facts["low"] < truth < found.facts["high"]
+        assert "The quoted interval holds that." in open_words.text(found)
+    # Who states the words answers for them; and what the interval holds is what was wrong before.
+    stated = cid.fit(cid.read_rig(folder(tmp_path / "stated", time, x, m1, VISCOUS_LINEAR)), budget=None)
+    assert "sd_unwidened" not in stated.summary or np.isnan(stated.summary.at["k1", "sd_unwidened"])
+    assert abs(stated.summary.at["k1", "value"] - k1) > 10.0 * stated.summary.at["k1", "sd"]
 
 
 def asked(path: Path) -> str:

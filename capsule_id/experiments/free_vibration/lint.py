@@ -453,9 +453,10 @@ def _hidden(facts: Facts) -> str:
         remedies.append("release from smaller deflections")
     if free:
         remedies.append(f"write {' and '.join(free)} in the experiment for an interval that includes this")
+    held = "" if facts["swings"] or facts["low"] == 0.0 else " The quoted interval holds that."
     return (
         f"{', '.join(facts['labels'])}: expected records that exclude {effects}; they do not. {found} (the fit without: "
-        f"{facts['value']:.3g}). {', or '.join(remedies)}. If another measurement excludes {effects}, write "
+        f"{facts['value']:.3g}).{held} {', or '.join(remedies)}. If another measurement excludes {effects}, write "
         f"{' and '.join(known)}."
     )
 

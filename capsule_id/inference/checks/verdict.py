@@ -300,6 +300,13 @@ def beside_stated(s: SampledFit, found: Mapping[str, Widening]) -> dict[str, Wid
     return result
 
 
+def model_errors(s: SampledFit) -> dict[str, Widening]:
+    """Error of the model by name of the parameter: from forces that the readings allow, or from parts of the data."""
+    allowed = [f.facts for f in s.findings if f.code == "decays.hidden" and f.level == "warn"]
+    found = {facts["name"]: Widening(1.0, 1.0, 0, (facts["low"], facts["high"])) for facts in allowed}
+    return {**found, **beside_stated(s, {**widenings(s), **record_widenings(s)})}
+
+
 def has_own_nuisances(e: Experiment) -> bool:
     """Whether ``e`` is a run, or a record with an amplitude of its own: its parts have other nuisances than the whole."""
     return e.event_driven or any(not (row.physical or row.scatter or is_stated(row.name)) for row in e.parameters)
