@@ -461,6 +461,13 @@ def _hidden(facts: Facts) -> str:
     )
 
 
+_HELD = (
+    "{label}: the readings do not tell the release from one up to a quarter of a period later. {name} then lies between "
+    "{low:.3g} and {high:.3g} {unit} (the fit: {value:.3g})."
+)
+_FREE = "If the rod is free from the first reading of the fit on, add this line to the experiment in rig.toml: "
+_FREE += line_of("start")
+
 MESSAGES = {
     **LINT_MESSAGES,
     **KINEMATIC_MESSAGES,
@@ -469,6 +476,12 @@ MESSAGES = {
         ok="{labels}: no further force that the records allow changes c or k1 by much",
         warn=_hidden,
         fail=_hidden,
+    ),
+    "decays.held": Message(
+        "release of a decay",
+        ok="{labels}: k1 and c do not depend on the instant of the release",
+        warn=_HELD + " The quoted interval holds that. " + _FREE,
+        fail=_HELD + " " + _FREE,
     ),
     "decays.stiffness": Message(
         "stiffness against amplitude",
