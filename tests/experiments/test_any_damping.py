@@ -422,6 +422,16 @@ def test_a_strongly_damped_decay_has_no_jump(tmp_path: Path, seed: int, lost: ra
     assert "readings.jump" in {found.code for found in lint(rig, kinds, rig.tables)}
 
 
+def test_a_blow_on_an_overdamped_rod_has_no_jump(tmp_path: Path) -> None:
+    """Before: "it jumps" in all of them, because the rod is 3.7 times as fast at the blow as its period says."""
+    time, kinds = np.arange(240) / 40.0, default_registry()
+    motion = decrement.viscous_basis(time, (2.0 * np.pi) ** 2, 8.0 * np.pi, 1.0, np)[:, 1]
+    for seed in range(4):
+        x = motion / np.max(motion) + 0.005 * np.random.default_rng(seed).standard_normal(len(time))
+        rig = cid.read_rig(folder(tmp_path / str(seed), time, x, 1.0))
+        assert "readings.jump" not in {one.code for one in lint(rig, kinds, rig.tables)}
+
+
 def test_a_light_decay_is_known_by_a_hundred_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before: the search for a strong damping took 15 ms of every record of 400 samples, a third of a check."""
     sizes = list[int]()

@@ -85,7 +85,7 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
             kept = max(int(np.searchsorted(time[used], decay.end, side="right")), SHORTEST_RECORD)
             used = slice(used.start, min(used.start + kept, used.stop))
         # The spectrum of a strongly damped decay has no peak at its frequency, and it is smooth over less of a period.
-        period = min(period, 1.0 / decay_frequency(time[used], table[channels[0]][used]))
+        period = min(period, 1.0 / decay_frequency(time[used], table[channels[0]][used], fastest=True))
         # Dry friction makes an acceleration jump wherever the rod turns; lost samples make one jump that stands alone.
         faults = faults or [
             found for name in channels for found in lint_smooth(table, name, used, period, name == "acceleration")
