@@ -31,7 +31,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.kind import Choice, Registry, compare, select_tables
 from capsule_id.experiments.lint import lint
 from capsule_id.inference.checks.posterior import check_agreement, decisive_readings
-from capsule_id.inference.checks.verdict import beside_stated, record_widenings, run_checks, widenings, with_scaled
+from capsule_id.inference.checks.verdict import model_errors, run_checks, with_scaled
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.point_fit import point_fit_again
 from capsule_id.inference.point_stage import SampledFit
@@ -46,7 +46,7 @@ from capsule_id.views import Comparison, Finding
 #: Number of posterior draws for bands and predictive p-values, and of prior draws in the saved sample.
 BAND_DRAWS, PRIOR_DRAWS = 200, 2000
 #: Walkers, and draws of each, at which densities of left-out readings are stored; the largest number of stored replicates.
-POINTWISE, REPLICATES = 32, 1_000_000
+POINTWISE, REPLICATES = 24, 1_000_000
 #: Steps of the stored densities (natural logarithm) and replicates (in sd of a reading): a file packs rounded numbers to
 #: a third. The step of a replicate adds 0.002 % to its variance.
 DENSITY_STEP, REPLICATE_STEP = 2.0**-16, 2.0**-6
@@ -141,10 +141,14 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     checked = replace(
         checked, findings=(*checked.findings, *sampled.findings, *agreement, *check_engine(sampled), *before)
     )
-    widened = beside_stated(checked, {**widenings(checked), **record_widenings(checked)})
+    widened = model_errors(checked)
     findings = list(checked.findings)
     for lost in (False, True):
-        factors = [(name, one.factor, one.parts) for name, one in widened.items() if one.no_number == lost]
+        factors = [
+            (name, one.factor, one.parts)
+            for name, one in widened.items()
+            if one.no_number == lost and (lost or one.parts)
+        ]
         if factors:
             names = tuple(name for name, *_ in factors) if lost else ()
             findings.append(Finding("model.error", "fail" if lost else "warn", {"factors": factors}, parameters=names))

@@ -76,12 +76,14 @@ class Widening:
     ----------
     factor : of its sd, at least 1
     quantile : Student's t quantile over the normal one, for the ends of the 95 % interval
-    parts : number of parts of the data
+    parts : number of parts of the data; 0: none, the readings allow forces that move the value between ``limits``
+    limits : of the 95 % interval, SI, in the place of factor and quantile
     """
 
     factor: float
     quantile: float
     parts: int
+    limits: tuple[float, float] | None = None
 
     @property
     def stretch(self) -> float:

@@ -16,7 +16,7 @@ from capsule_id.inference.least_squares import linearised, rows_of
 from capsule_id.inference.point_stage import SampledFit, Widening
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target import LogPosterior
-from capsule_id.parameters import INSTRUMENT_WORDS, Parameter, is_stated, parameter
+from capsule_id.parameters import INSTRUMENT_WORDS, QUANTILE_975, Parameter, is_stated, parameter
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.views import Finding, ResultTable
 
@@ -296,17 +296,24 @@ def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool
         return {}
     if widening.no_number:
         return {"widening": widening.factor, **dict.fromkeys(("value", "sd", "lower", "upper"), np.nan)}
-    found: dict[str, object] = {
-        "widening": widening.factor,
-        "sd": widening.factor * entry["sd"],
-        "sd_unwidened": entry["sd"],
+    factor, value, stretch = widening.factor, entry["value"], widening.stretch
+    if widening.limits is None:
+        own = {end: entry[end] for end in ("lower", "upper") if end in entry}
+        moved = {
+            end: value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
+            for end, limit in own.items()
+        }
+    else:
+        low, high = widening.limits
+        moved = {"lower": min(low, entry.get("lower", low)), "upper": max(high, entry.get("upper", high))}
+        factor = max((moved["upper"] - moved["lower"]) / (2.0 * QUANTILE_975 * entry["sd"]), 1.0)
+    before = {f"{key}_unwidened": entry[key] for key in ("sd", "lower", "upper") if key in entry}
+    return {
+        "widening": factor,
+        "sd": factor * entry["sd"],
+        **before,
+        **{end: moved[end] for end in moved if end in entry},
     }
-    for end in ("lower", "upper"):
-        if end in entry:
-            value, limit, stretch = entry["value"], entry[end], widening.stretch
-            moved = value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
-            found |= {end: moved, f"{end}_unwidened": limit}
-    return found
 
 
 def _limited(entry: Mapping[str, Any]) -> dict[str, object]:

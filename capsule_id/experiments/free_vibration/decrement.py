@@ -341,13 +341,19 @@ def damping_of_peaks(decrement: Decrement, m1: float, deflection: float, symbols
     return dict(zip(chosen, (float(part) for part in parts), strict=True))
 
 
-def decay_frequency(time: np.ndarray, values: np.ndarray) -> float:
-    """Dominant frequency of a decay, Hz; where its spectrum has no peak because of strong damping, omega_0 of a fit."""
+def decay_frequency(time: np.ndarray, values: np.ndarray, fastest: bool = False) -> float:
+    """Dominant frequency of a decay, Hz; where its spectrum has no peak because of strong damping, omega_0 of a fit.
+
+    ``fastest`` : beyond critical damping the rate of the faster exponential in the place of omega_0
+    """
     frequency = frequency_of(time, values)
     if frequency * float(time[-1] - time[0]) > FEW_PERIODS or np.ptp(values) == 0.0:
         return frequency
     found = _fit_of(*(np.asarray(part, float).tobytes() for part in shortened(time, values)))
-    return found.omega / (2.0 * np.pi) if found.ratio > PEAKLESS else frequency
+    if found.ratio <= PEAKLESS:
+        return frequency
+    faster = found.ratio + float(np.sqrt(found.ratio**2 - 1.0)) if fastest and found.ratio > 1.0 else 1.0
+    return faster * found.omega / (2.0 * np.pi)
 
 
 @lru_cache(maxsize=8)

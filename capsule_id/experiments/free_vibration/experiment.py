@@ -13,6 +13,7 @@ from capsule_id.experiments.base import LEVEL, Check, Fitted, Start, ValuesBySym
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
+    check_held,
     check_hidden_terms,
     sensitivities,
     zero_jumps,
@@ -346,6 +347,7 @@ class FreeVibration(DecayRecord):
         check_drift,
         check_zero,
         check_hidden_terms,
+        check_held,
     )
     tables = (decay_table, damping_table)
 

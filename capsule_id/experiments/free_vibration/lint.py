@@ -85,7 +85,7 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
             kept = max(int(np.searchsorted(time[used], decay.end, side="right")), SHORTEST_RECORD)
             used = slice(used.start, min(used.start + kept, used.stop))
         # The spectrum of a strongly damped decay has no peak at its frequency, and it is smooth over less of a period.
-        period = min(period, 1.0 / decay_frequency(time[used], table[channels[0]][used]))
+        period = min(period, 1.0 / decay_frequency(time[used], table[channels[0]][used], fastest=True))
         # Dry friction makes an acceleration jump wherever the rod turns; lost samples make one jump that stands alone.
         faults = faults or [
             found for name in channels for found in lint_smooth(table, name, used, period, name == "acceleration")
@@ -453,12 +453,20 @@ def _hidden(facts: Facts) -> str:
         remedies.append("release from smaller deflections")
     if free:
         remedies.append(f"write {' and '.join(free)} in the experiment for an interval that includes this")
+    held = "" if facts["swings"] or facts["low"] == 0.0 else " The quoted interval holds that."
     return (
         f"{', '.join(facts['labels'])}: expected records that exclude {effects}; they do not. {found} (the fit without: "
-        f"{facts['value']:.3g}). {', or '.join(remedies)}. If another measurement excludes {effects}, write "
+        f"{facts['value']:.3g}).{held} {', or '.join(remedies)}. If another measurement excludes {effects}, write "
         f"{' and '.join(known)}."
     )
 
+
+_HELD = (
+    "{label}: the readings do not tell the release from one up to a quarter of a period later. {name} then lies between "
+    "{low:.3g} and {high:.3g} {unit} (the fit: {value:.3g})."
+)
+_FREE = "If the rod is free from the first reading of the fit on, add this line to the experiment in rig.toml: "
+_FREE += line_of("start")
 
 MESSAGES = {
     **LINT_MESSAGES,
@@ -468,6 +476,12 @@ MESSAGES = {
         ok="{labels}: no further force that the records allow changes c or k1 by much",
         warn=_hidden,
         fail=_hidden,
+    ),
+    "decays.held": Message(
+        "release of a decay",
+        ok="{labels}: k1 and c do not depend on the instant of the release",
+        warn=_HELD + " The quoted interval holds that. " + _FREE,
+        fail=_HELD + " " + _FREE,
     ),
     "decays.stiffness": Message(
         "stiffness against amplitude",

@@ -300,6 +300,16 @@ def beside_stated(s: SampledFit, found: Mapping[str, Widening]) -> dict[str, Wid
     return result
 
 
+def model_errors(s: SampledFit) -> dict[str, Widening]:
+    """Error of the model by name of the parameter: what the readings allow (forces, a hold), or from parts of the data."""
+    found: dict[str, Widening] = {}
+    for facts in (f.facts for f in s.findings if f.level == "warn" and f.code in ("decays.hidden", "decays.held")):
+        limits = facts["low"], facts["high"]
+        before = found[facts["name"]].limits if facts["name"] in found else limits
+        found[facts["name"]] = Widening(1.0, 1.0, 0, (min(limits[0], before[0]), max(limits[1], before[1])))
+    return {**found, **beside_stated(s, {**widenings(s), **record_widenings(s)})}
+
+
 def has_own_nuisances(e: Experiment) -> bool:
     """Whether ``e`` is a run, or a record with an amplitude of its own: its parts have other nuisances than the whole."""
     return e.event_driven or any(not (row.physical or row.scatter or is_stated(row.name)) for row in e.parameters)
