@@ -195,10 +195,7 @@ def comparison_caption(item: Comparison, captions: Mapping[str, str]) -> str:
     """What the panel shows, and its posterior predictive p-value where there is one."""
     parts = [captions.get(item.kind, "Measured beside predicted.")]
     if figures.period_of(item):
-        parts.append(
-            f"Above at the left: the range in each period; at the right: the {figures.PERIODS_IN_FULL} periods with the "
-            "largest residuals."
-        )
+        parts.append("Above: the range in each period, and the periods with the largest residuals.")
     if item.residuals is not None:
         parts.append("Shaded: the range that holds 95 % of a good fit's residuals.")
     if any(points.flagged is not None and points.flagged.any() for points in item.points):

@@ -206,7 +206,8 @@ def test_a_record_of_many_periods_shows_three_of_them_in_full(period: int) -> No
     np.testing.assert_array_equal(low.get_ydata(), in_periods.min(axis=1))
     np.testing.assert_array_equal(high.get_ydata(), in_periods.max(axis=1))
     assert len(figures.comparison_figure(item).axes) == 4
-    assert "3 periods with the largest residuals" in comparison_caption(item, {})
+    assert "the periods with the largest residuals" in comparison_caption(item, {})
+    assert "periods" not in comparison_caption(dataclasses.replace(item, curves=()), {})
 
 
 def test_a_decay_and_a_short_record_are_drawn_whole(result: Result) -> None:
