@@ -13,8 +13,9 @@ from capsule_id.report.html import Picture, render
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-#: Runs in the page: sorts the first sortable table twice, then says what it sees in the title.
+#: Runs in the page: opens all parts, sorts the first sortable table twice, then says what it sees in the title.
 PROBE = """<script>
+for (const part of document.querySelectorAll("details")) part.open = true;
 const button = [...document.querySelectorAll("th button")].find(item => item.textContent === "value ± sd");
 const table = button.closest("table");
 const place = [...button.closest("tr").children].indexOf(button.closest("th"));
