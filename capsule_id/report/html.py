@@ -300,13 +300,15 @@ def sections_of(result: Result, measured: Sequence[Picture], shown: Sequence[Sho
                 table.label for table in tables if item.kind in getattr(result.registry.get(table.kind), "captions", ())
             }
             labels[group] = {group, *drawn}
-    groups = dict.fromkeys(picture.group for picture in measured)
+    groups, known = dict.fromkeys(picture.group for picture in measured), {table.label for table in tables}
     home = {label: group for group in groups for label in labels.get(group, {group})}
     own: dict[str, list[Shown]] = {"": []} | {group: [] for group in groups}
     for one in shown:
         if one.finding.level != "ok":
-            label = one.finding.experiment or one.finding.code.partition(".")[0]
-            own.setdefault(home.get(label, one.finding.experiment), []).append(one)
+            label, topic = one.finding.experiment, one.finding.code.partition(".")[0]
+            # A shared panel has the name of its checks; a table may have any name.
+            topic = topic if topic in groups and topic not in known else ""
+            own.setdefault(home.get(label, label) or topic, []).append(one)
     sections = []
     for label, found in own.items():
         drawn = [picture for picture in measured if picture.group == label]

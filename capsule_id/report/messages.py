@@ -24,10 +24,13 @@ TERMS: Mapping[str, str] = {
     "point fit, MAP": "Parameters at the maximum of the posterior.",
     "log-posterior": "Logarithm of the posterior density. A difference of 3 means that a point is 20 times less probable.",
     "R-hat": "Compares independent runs of the sampler. 1 is perfect; above 1.01 they do not agree yet.",
+    "chi-square": "Sum of the squared residuals; for a good fit about the number of readings less that of parameters.",
+    "autocorrelation time": "Number of steps of the sampler after which a draw no longer depends on an earlier one.",
+    "Pareto shape": "How much one reading changes the sample. Above the limit the sample cannot predict that reading.",
     "ESS": "Effective sample size: number of independent draws that are as informative as the sample.",
 }
 #: Terms that appear only where there is a sample.
-OF_A_SAMPLE = frozenset({"95 % interval", "R-hat", "ESS"})
+OF_A_SAMPLE = frozenset({"95 % interval", "R-hat", "ESS", "autocorrelation time", "Pareto shape"})
 
 
 # posterior: Texts of findings on the maximum, the sample and the priors of a fit, by code.

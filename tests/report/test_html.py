@@ -210,6 +210,22 @@ def test_findings_of_tables_with_a_shared_panel_stand_beside_it(result: Result, 
     assert re.search(r"friction ! warning .{,400}! warning outliers Does a reading stand apart", page)
 
 
+def test_a_table_with_the_name_of_a_check_has_no_findings_of_the_whole_fit(result: Result) -> None:
+    rig = read_rig(DATA)
+    table = replace(rig.tables[0], label="priors")
+    named = replace(result, rig=replace(rig, tables=(table,)), findings=(Finding("priors.tails", "warn", {}),))
+    page = Page(render(named, [Picture("x", "measured", "t", "c", 9, 9, b"", group="priors")])).text
+    assert "The whole fit ! warning" in page
+    assert "priors ✓ ok" in page
+
+
+def test_terms_of_the_questions_are_explained() -> None:
+    words = {"R-hat", "autocorrelation time", "chi-square", "sd", "Pareto shape", "prior", "white", "residual"}
+    asked = " ".join(QUESTIONS.values()).lower()
+    assert all(word.lower() in asked for word in words)
+    assert words <= TERMS.keys()
+
+
 def sketch_of(result: Result) -> str:
     (svg,) = re.findall(r"<svg.*?</svg>", render(result, ()), re.DOTALL)
     return " ".join(re.sub(r"<[^>]*>", " ", svg).split())
