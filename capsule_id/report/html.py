@@ -36,8 +36,8 @@ from capsule_id.report.columns import (
 )
 from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import figure_of, mark, new_axes, new_figure, png
-from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, title_of
-from capsule_id.views import Comparison, Level, Message, ResultTable, after_number, counted
+from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, question_of, title_of
+from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, after_number, counted
 
 # gallery: All pictures of a result, drawn once: the page embeds the same bytes as in ``figures/``.
 
@@ -47,9 +47,11 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 _LONGEST = 80
 # Wider than this (CSS pixels) does not go in pairs.
 _HALF_PAGE = 650
+#: Symbols of the sketch of the rig.
+SKETCHED = ("m1", "m2", "k1", "c", "k2", "G", "mu")
 
 
-Section = Literal["measured", "sample", "point_fit"]
+Part = Literal["measured", "sample", "point_fit"]
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Picture:
     """
 
     name: str
-    section: Section
+    section: Part
     title: str
     caption: str
     width: int
@@ -84,7 +86,7 @@ class Picture:
 
 
 #: Name, section, title, caption, figure, alternative text and group of a picture.
-Drawing = tuple[str, Section, str, str, Figure, str, str]
+Drawing = tuple[str, Part, str, str, Figure, str, str]
 
 
 def pictures(result: Result) -> tuple[Picture, ...]:
@@ -192,6 +194,8 @@ def _corner_alt(columns: SampledParameters) -> str:
 def comparison_caption(item: Comparison, captions: Mapping[str, str]) -> str:
     """What the panel shows, and its posterior predictive p-value where there is one."""
     parts = [captions.get(item.kind, "Measured beside predicted.")]
+    if figures.period_of(item):
+        parts.append("Above: the range in each period, and the periods with the largest residuals.")
     if item.residuals is not None:
         parts.append("Shaded: the range that holds 95 % of a good fit's residuals.")
     if any(points.flagged is not None and points.flagged.any() for points in item.points):
@@ -215,32 +219,64 @@ def _unique(labels: Iterable[str]) -> list[str]:
 
 
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
-#: Largest number of figures of experiments that are open at first; those of the sample and the point fit add 3.
-MOST_OPEN = 9
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A finding with its texts; ``asked``: question, number and limit of its check, "" where there is none."""
+
+    finding: Finding
+    title: str
+    asked: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """What the page shows of one experiment, or, with the label "", of the whole fit.
+
+    Attributes
+    ----------
+    level : the worst one of its findings
+    shown : findings that are not ok, the worst first
+    picture, others : the picture of its worst failed check, else the first one; those of the appendix
+    labels : of the tables that the picture shows
+    """
+
+    label: str
+    level: Level
+    shown: tuple[Shown, ...]
+    picture: Picture | None
+    others: tuple[Picture, ...]
+    labels: frozenset[str]
 
 
 def render(result: Result, pictures: Sequence[Picture]) -> str:
     """The page for ``result``; ``pictures`` as ``pictures`` draws them. The same input gives the same text."""
     messages = messages_of(result.registry)
     stated_last = sorted(table_rows(result.summary), key=lambda row: is_stated(row.name))
-    worst_first = sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
-    # Narrow pictures go in pairs, and a wide one between them leaves a gap.
-    narrow_first = sorted(pictures, key=lambda picture: picture.wide)
-    titles = {finding.code: title_of(finding.code, messages) for finding in result.findings}
+    shown = [
+        Shown(found, title_of(found.code, messages), question_of(found), finding_text(found, messages))
+        for found in sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
+    ]
+    sections = sections_of(result, [picture for picture in pictures if picture.section == "measured"], shown)
+    lead, reason = leading_section(result, sections)
     tables = select_tables(result.rig, result.provenance.experiments)
     return _ENVIRONMENT.get_template("report.html.j2").render(
         result=result,
         answers=stated_last,
+        parts={symbol: [row for row in stated_last if symbol_of(row.name) == symbol] for symbol in SKETCHED},
         steps=next_steps(result),
         skewed=skewed_names(result.summary),
         left_out=errors_left_out(result.summary),
-        experiments=_experiments(result, [picture for picture in pictures if picture.section == "measured"]),
-        pictures=narrow_first,
+        sections=sections,
+        lead=lead,
+        reason=reason,
+        pictures=pictures,
         parameters=printed_table(result.summary, "html"),
         nuisances=printed_table(result.nuisances, "html"),
-        checks=dict.fromkeys(titles.values()),
-        findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
-        verdict=verdict_text(result.trust, [(found.level, titles[found.code]) for found in result.findings]),
+        passed=[one for one in shown if one.finding.level == "ok"],
+        verdict=verdict_text(result.trust, [(one.finding.level, one.title) for one in shown]),
         best=np.nanmax(result.point_fit.log_posterior),
         notes=[_note(note, messages) for note in result.notes],
         terms={term: TERMS[term] for term in TERMS if result.posterior or term not in OF_A_SAMPLE},
@@ -254,25 +290,64 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
     )
 
 
-def _experiments(result: Result, measured: Sequence[Picture]) -> list[dict[str, object]]:
-    """One entry per experiment: label, worst level of its findings, pictures, whether it is open at first.
+def sections_of(result: Result, measured: Sequence[Picture], shown: Sequence[Shown]) -> list[Section]:
+    """The whole fit and every experiment with a picture or a finding that is not ok, the worst first."""
+    tables = result.rig.tables
+    labels = {table.label: {table.label} for table in tables}
+    for item in result.comparisons:
+        if (group := _group(result, item.label)) not in labels:  # a panel of several tables
+            drawn = {
+                table.label for table in tables if item.kind in getattr(result.registry.get(table.kind), "captions", ())
+            }
+            labels[group] = {group, *drawn}
+    groups, known = dict.fromkeys(picture.group for picture in measured), {table.label for table in tables}
+    home = {label: group for group in groups for label in labels.get(group, {group})}
+    own: dict[str, list[Shown]] = {"": []} | {group: [] for group in groups}
+    for one in shown:
+        if one.finding.level != "ok":
+            label, topic = one.finding.experiment, one.finding.code.partition(".")[0]
+            # A shared panel has the name of its checks; a table may have any name.
+            topic = topic if topic in groups and topic not in known else ""
+            own.setdefault(home.get(label, label) or topic, []).append(one)
+    sections = []
+    for label, found in own.items():
+        drawn = [picture for picture in measured if picture.group == label]
+        worst = _UNSAFE.sub("_", str(found[0].finding.facts.get("record", "")) if found else "") or "none"
+        drawn.sort(key=lambda picture: not picture.name.endswith(worst))
+        level = found[0].finding.level if found else "ok"
+        # Narrow pictures go in pairs, and a wide one between them leaves a gap.
+        others = tuple(sorted(drawn[1:], key=lambda picture: picture.wide))
+        names = frozenset(labels.get(label, {label}))
+        sections.append(Section(label, level, tuple(found), drawn[0] if drawn else None, others, names))
 
-    Experiments with a failure or a warning are open, as long as fewer than ``MOST_OPEN`` figures are.
+    def place(section: Section) -> tuple[int, bool]:
+        return _WORST_FIRST.index(section.level), section.picture is not None and section.picture.wide
+
+    return sorted(sections, key=place)
+
+
+def leading_section(result: Result, sections: Sequence[Section]) -> tuple[Section | None, str]:
+    """The section whose picture convinces or warns, and why; None without a picture.
+
+    It is that of the worst failed check, else of the experiment that informs most of the parameters. A fault that is no
+    matter of chance has no probability; it is worse than one that has.
     """
-    shared = {picture.group for picture in measured}.difference(table.label for table in result.rig.tables)
-    named: dict[str, Level] = {}
-    for level in reversed(_WORST_FIRST):
-        found = [finding for finding in result.findings if finding.level == level]
-        named |= {label: level for label in (finding.code.partition(".")[0] for finding in found) if label in shared}
-        named |= {finding.experiment: level for finding in found}
-    entries, shown = [], 0
-    for group in dict.fromkeys(picture.group for picture in measured):
-        own = sorted((picture for picture in measured if picture.group == group), key=lambda picture: picture.wide)
-        level = named.get(group, "ok")
-        is_open = level != "ok" and shown + len(own) <= MOST_OPEN
-        shown += len(own) if is_open else 0
-        entries.append({"label": group, "level": level, "pictures": own, "open": is_open})
-    return entries
+    drawn = [section for section in sections if section.picture]
+    if not drawn:
+        return None, ""
+    if failed := [section for section in drawn if section.level == "fail"]:
+        faults = [(one.finding.facts.get("p", -1.0), i, one) for i, part in enumerate(failed) for one in part.shown[:1]]
+        _, i, worst = min(faults, key=lambda fault: fault[:2])
+        return failed[i], f"The worst failed check: {worst.title}."
+    whole = (one for section in sections if not section.label for one in section.shown)
+    doubted = [one for one in whole if one.finding.level == "fail"]
+    names = [name for one in doubted for name in one.finding.parameters] or [str(name) for name in result.summary.index]
+    shares = [result.point_fit.shares.get(name, {}) for name in names]
+    informs = [sum(own.get(label, 0.0) for own in shares for label in section.labels) for section in drawn]
+    best = drawn[int(np.argmax(informs))]
+    if doubted:
+        return best, f"Failed: {doubted[0].title}. This experiment informs the parameters concerned most."
+    return best, "No check failed. This experiment informs most of the parameters."
 
 
 def summary_html(result: Result, verdict: str, changes: Sequence[str]) -> str:

@@ -24,10 +24,13 @@ TERMS: Mapping[str, str] = {
     "point fit, MAP": "Parameters at the maximum of the posterior.",
     "log-posterior": "Logarithm of the posterior density. A difference of 3 means that a point is 20 times less probable.",
     "R-hat": "Compares independent runs of the sampler. 1 is perfect; above 1.01 they do not agree yet.",
+    "chi-square": "Sum of the squared residuals; for a good fit about the number of readings less that of parameters.",
+    "autocorrelation time": "Number of steps of the sampler after which a draw no longer depends on an earlier one.",
+    "Pareto shape": "How much one reading changes the sample. Above the limit the sample cannot predict that reading.",
     "ESS": "Effective sample size: number of independent draws that are as informative as the sample.",
 }
 #: Terms that appear only where there is a sample.
-OF_A_SAMPLE = frozenset({"95 % interval", "R-hat", "ESS"})
+OF_A_SAMPLE = frozenset({"95 % interval", "R-hat", "ESS", "autocorrelation time", "Pareto shape"})
 
 
 # posterior: Texts of findings on the maximum, the sample and the priors of a fit, by code.
@@ -366,6 +369,65 @@ def messages_of(registry: Registry) -> Mapping[str, Message]:
 def title_of(code: str, messages: Mapping[str, Message]) -> str:
     """The title of a check or a table; the code itself where no kind declares words for it."""
     return messages[code].title if code in messages else code
+
+
+#: The question of a check; behind it the number that answers it and the limit, as far as its facts have them.
+QUESTIONS: Mapping[str, str] = {
+    "starts.agree": "Do all starting points end at the same maximum? {elsewhere} of {starts} ended elsewhere, limit 0.",
+    "chains.converged": (
+        "Has the sampler converged? R-hat {rhat:.4f}, limit {rhat_wanted:g}; {length:.0f} autocorrelation times, at least "
+        "{length_wanted:.0f}; effective sample size {size:.0f}, at least {size_wanted:.0f}."
+    ),
+    "readings.decisive": "Does one reading decide a parameter? {far} of {number} do (Pareto shape above {limit:g}).",
+    "sample.maximum": "Does the maximum lie within the sample? {distance:.1f} sd apart, limit 3.",
+    "sample.modes": "Does the sample have one mode?",
+    "parameters.informed": "Do the data narrow the prior of every parameter?",
+    "priors.conflict": "Do priors and data agree? {z:+.1f} sd apart ({p:p}), limit p = 0.002 over all priors.",
+    "priors.tails": "Does a parameter end in the tail of its prior? The limit is 2.5 sd.",
+    "residuals.white": "Are the residuals of each record white? {p:p}, limit 0.002 over all records.",
+    "trials.order": (
+        "Are neighbouring trials independent? Correlation {correlation:.2f} ({p:p}), limits 0.2 and p = 0.005 over all tables."
+    ),
+    "trials.tables": "Do tables of equal tests agree? They scatter {factor:.1f} times too much ({p:p}), limit p = 0.005.",
+    "trials.loads": "Is the friction in proportion to the normal force? {p:p}, limit 0.005.",
+    "trials.speeds": "Does the friction fall with the speed as the law says? {p:p}, limit 0.005.",
+    "residuals.statistics": "Do the residuals look like random noise? {p:p}, limit 0.002 over all statistics.",
+    "outliers": "Does a reading stand apart? {score:.3g} sd off ({p:p}), limit p = 0.002 over all readings.",
+    "errors.stated": "Do the stated errors explain the scatter? Chi-square {chi_square:.0f}, expected {freedom}.",
+    "bench_and_runs.agree": (
+        "Do bench tests and forced runs agree? {distances[0][0]}: {distances[0][1]:+.1f} sd apart, "
+        "p = {distances[0][2]:.2g}, limit 0.02."
+    ),
+    "model.engine": "Would the exact engine change the numbers? By {largest:.2g} sd, limit {wanted:g}.",
+    "runs.predictable": "Does one initial state predict the whole run? Its error grows {growth:.2g} times, limit 1000.",
+    "runs.repeated": "Does the misfit repeat with the excitation? {p:p}, limit 0.002 over all channels.",
+    "decays.halves": "Do both halves of the record agree? {name}: {z:.2g} sd apart, limit 4 (a warning above 3).",
+    "decays.stiffness": "Is k1 the same at all amplitudes? {p:p}, limit 0.002.",
+    "decays.position": "Do the residuals depend on the position? {p:p}, limit 0.002 over all records.",
+    "decays.residuals": "Do the residuals grow with the amplitude? {p:p}, limit 0.002 over all records.",
+    "decays.drift": "Is the drift of the zero slower than the motion? Its part at that frequency is {share:.1%}.",
+    "lines.straight": (
+        "Is the calibration line straight? "
+        "It bends by {departure:.1%} of the range ({p:p}), limit p = 0.002 over all lines."
+    ),
+    "lines.replicates": (
+        "Do the means of repeated readings lie on the line? "
+        "{deviation:.1f} sd of a reading off ({p:p}), limit p = 0.002."
+    ),
+    "friction.order": "Do the residuals of the friction tests show an order in speed? {p:p}, limit 0.002.",
+    "friction.one_surface": "Do tilts and slides show one surface? {p:p}, limit 0.002.",
+    "friction.variants": "Is another friction law more probable? The best one is {factor:.3g} times as probable, limit 100.",
+    "springs.cantilever": "Does k2 fall as L^-3? The exponent is {exponent:.3f} ± {sd:.3f} ({p:p}), limit p = 0.002.",
+}
+
+
+def question_of(finding: Finding) -> str:
+    """Question, number and limit of a check; the question alone where a fact is missing; "" for a code without one."""
+    asked = QUESTIONS.get(finding.code, "")
+    try:
+        return filled_in(asked, finding.facts)
+    except TEXT_ERRORS:
+        return asked.partition("?")[0] + "?"
 
 
 def finding_text(finding: Finding, messages: Mapping[str, Message]) -> str:

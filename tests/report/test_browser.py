@@ -13,8 +13,9 @@ from capsule_id.report.html import Picture, render
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-#: Runs in the page: sorts the first sortable table twice, then says what it sees in the title.
+#: Runs in the page: opens all parts, sorts the first sortable table twice, then says what it sees in the title.
 PROBE = """<script>
+for (const part of document.querySelectorAll("details")) part.open = true;
 const button = [...document.querySelectorAll("th button")].find(item => item.textContent === "value ± sd");
 const table = button.closest("table");
 const place = [...button.closest("tr").children].indexOf(button.closest("th"));
@@ -25,11 +26,12 @@ button.click();
 const down = numbers();
 const rows = JSON.stringify([up, down, document.documentElement.scrollWidth, innerWidth,
   getComputedStyle(document.body).backgroundColor,
-  [...document.querySelectorAll(".findings td.text")].filter(cell => cell.getBoundingClientRect().right > innerWidth).length,
+  [...document.querySelectorAll(".findings span")].filter(part => part.getBoundingClientRect().right > innerWidth).length,
   [...document.images].filter(image => image.width > Number(image.getAttribute("width"))).length]);
-const paper = new Event("beforeprint");
-dispatchEvent(paper);
-document.title = rows + "|" + document.querySelectorAll("details:not([open])").length;
+const boxes = [...document.querySelectorAll("svg.rig text")].map(text => text.getBBox());
+const crossed = boxes.filter((a, i) => boxes.some((b, j) => i < j && Math.min(a.x + a.width, b.x + b.width) > Math.max(a.x, b.x)
+  && Math.min(a.y + a.height, b.y + b.height) > Math.max(a.y, b.y)) || a.x < 0 || a.x + a.width > 520 || a.y + a.height > 262);
+document.title = rows + "|" + crossed.length;
 </script>"""
 
 
@@ -50,13 +52,13 @@ def browse(file: Path, *flags: str) -> tuple[str, list[str]]:
 
 
 def seen(document: str) -> tuple[list[float], list[float], int, int, str, int, int, int]:
-    """What ``PROBE`` has written: sorted numbers, widths, background, cut findings, magnified figures, closed parts."""
+    """What ``PROBE`` has written: sorted numbers, widths, background, cut findings, magnified figures, faults of the sketch."""
     import html
     import json
 
     (title,) = re.findall(r"<title>(.*?)</title>", document)
-    values, closed = html.unescape(title).split("|")
-    return (*json.loads(values), int(closed))
+    values, crossed = html.unescape(title).split("|")
+    return (*json.loads(values), int(crossed))
 
 
 def test_it_opens_without_a_message_and_sorts(result: Result, drawn: tuple[Picture, ...], tmp_path: Path) -> None:
@@ -64,13 +66,13 @@ def test_it_opens_without_a_message_and_sorts(result: Result, drawn: tuple[Pictu
     file.write_text(render(result, drawn).replace("</body>", PROBE + "</body>"), encoding="utf-8")
     document, messages = browse(file, "--blink-settings=preferredColorScheme=0")
     assert messages == []
-    up, down, _, _, background, _, magnified, closed = seen(document)
+    up, down, _, _, background, _, magnified, crossed = seen(document)
     assert up == sorted(up)
     assert down == up[::-1]
     assert len(up) == len(result.summary)
     assert background == "rgb(23, 24, 26)"  # the dark scheme
     assert magnified == 0
-    assert closed == 0  # all parts are open for the printer
+    assert crossed == 0  # values of the sketch lie apart and inside
 
 
 def test_it_fits_a_phone(unclean: Result, drawn: tuple[Picture, ...], tmp_path: Path) -> None:
@@ -88,6 +90,22 @@ def test_it_fits_a_phone(unclean: Result, drawn: tuple[Picture, ...], tmp_path: 
     assert (window, background) == (390, "rgb(255, 255, 255)")
     assert width <= window
     assert cut == 0  # no text of a finding begins or ends outside
+
+
+def test_few_pages_are_printed_unless_parts_are_opened(
+    result: Result, drawn: tuple[Picture, ...], tmp_path: Path
+) -> None:
+    """Page one, then a picture of each experiment; the appendix is printed as far as it is open."""
+
+    def pages(text: str) -> int:
+        (tmp_path / "page.html").write_text(text, encoding="utf-8")
+        browse(tmp_path / "page.html", f"--print-to-pdf={tmp_path / 'page.pdf'}")
+        return len(re.findall(rb"/Type\s*/Page\b", (tmp_path / "page.pdf").read_bytes()))
+
+    text = render(result, drawn)
+    closed = pages(text)
+    assert 3 <= closed <= 8
+    assert pages(text.replace("<details", "<details open")) > closed + 2
 
 
 def test_a_message_would_be_noticed(tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ from capsule_id.inference.result import Posterior, Result
 from capsule_id.report.columns import sampled_parameters
 from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import figure_of, new_axes, new_figure, png
-from capsule_id.report.html import Picture, pictures
-from capsule_id.views import Comparison
+from capsule_id.report.html import Picture, comparison_caption, pictures
+from capsule_id.views import Comparison, Curve, Points
 
 #: ``name, unit``; a name alone has no unit.
 UNIT = re.compile(r",\s[^,]+$|^(autocorrelation|residual / sd|friction coefficient|step after burn-in|μ)$")
@@ -172,6 +172,52 @@ def test_missing_parts_are_refused_not_drawn_empty(result: Result) -> None:
     assert len(figures.comparison_figure(friction).axes) == 1
     assert len(figures.comparison_figure(_named(result, "motor_current")).axes) == 2
     assert len(figures.comparison_figure(_named(result, "free_vibration_1")).axes) == 3
+
+
+def forced_run(period: int = 150, n: int = 1800, decay: float = 0.0, bad: int = 700) -> Comparison:
+    """A record whose third harmonic is the largest one; its largest residuals are in the samples from ``bad`` on."""
+    rng, t = np.random.default_rng(0), np.arange(n) / 1000.0
+    phase = 2.0 * np.pi * np.arange(n) / period
+    fitted = np.exp(-decay * t) * (np.sin(phase) + 2.0 * np.sin(3.0 * phase)) + 0.3 * t
+    residuals = rng.normal(size=n)
+    residuals[bad : bad + 200] *= 3.0
+    return Comparison(
+        "forced_run", "run_1_x_rel", "run_1: x_rel", "time, s", "x_rel, mm",
+        points=(Points("run_1", t, fitted + 0.02 * residuals),),
+        curves=(Curve("this fit", t, fitted, fitted - 0.1, fitted + 0.1),),
+        residuals=residuals, autocorrelation=np.zeros(40),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("period", [60, 150])
+def test_a_record_of_many_periods_shows_three_of_them_in_full(period: int) -> None:
+    """2,000 dots covered the line."""
+    item = forced_run(period)
+    assert figures.period_of(item) == period
+    shown = figures.worst_periods(item, period)
+    (points,), (curve,) = shown.points, shown.curves
+    assert points.x.size == curve.y.size == curve.lower.size == 3 * period
+    assert points.x[0] <= 0.7 + 1e-9 + max(0.2 - 3e-3 * period, 0.0)
+    assert points.x[-1] >= min(0.7 + 3e-3 * period, 0.9) - 2e-3
+    np.testing.assert_array_equal(points.y, item.points[0].y[np.isin(item.points[0].x, points.x)])
+    figures.ranges(item, period, ax := new_axes())
+    low, high = ax.lines
+    in_periods = item.curves[0].y[: 1800 // period * period].reshape(-1, period)
+    np.testing.assert_array_equal(low.get_ydata(), in_periods.min(axis=1))
+    np.testing.assert_array_equal(high.get_ydata(), in_periods.max(axis=1))
+    assert len(figures.comparison_figure(item).axes) == 4
+    assert "the periods with the largest residuals" in comparison_caption(item, {})
+    assert "periods" not in comparison_caption(dataclasses.replace(item, curves=()), {})
+
+
+def test_a_decay_and_a_short_record_are_drawn_whole(result: Result) -> None:
+    decaying = forced_run(decay=12.0)
+    for item in (decaying, forced_run(n=90), forced_run(period=500), _named(result, "free_vibration_1")):
+        assert figures.period_of(item) == 0
+        assert len(figures.comparison_figure(item).axes) == 3
+    constant = dataclasses.replace(decaying, curves=(Curve("this fit", decaying.curves[0].x, np.ones(1800)),))
+    assert figures.period_of(constant) == figures.period_of(dataclasses.replace(decaying, curves=())) == 0
+    assert figures.period_of(_named(result, "motor_current")) == 0
 
 
 def test_stalled_starts_end_in_a_cross(result: Result) -> None:

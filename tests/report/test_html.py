@@ -11,14 +11,20 @@ import pandas as pd
 import pytest
 
 from capsule_id.api import read_rig
-from capsule_id.experiments.kind import Registry
+from capsule_id.experiments.base import LEVEL
+from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH
+from capsule_id.experiments.free_vibration.experiment import DISAGREE, FAIL
+from capsule_id.experiments.friction_variants import FACTOR
+from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.inference.checks.posterior import AGREEMENT_LEVEL, FARTHEST_MAXIMUM, PRIOR_PULL
+from capsule_id.inference.checks.settings import ORDER_LEVEL, SMALLEST_CORRELATION
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.report.columns import table_rows, verdict_text
 from capsule_id.report.html import Picture, pictures, render
-from capsule_id.report.messages import TERMS, finding_text, messages_of
+from capsule_id.report.messages import QUESTIONS, TERMS, finding_text, messages_of, question_of
 from capsule_id.views import Finding, Message, ResultTable, Text
 from tests.cli_tools import DATA
-from tests.report.conftest import OUTLIER
+from tests.report.conftest import COLOURED, OUTLIER
 
 EMPTY = {"meta", "img", "br"}
 
@@ -100,15 +106,142 @@ def test_symbols_are_set_as_in_the_paper(page: str) -> None:
         assert symbol in page
 
 
-def test_verdict_strip_has_text_beside_colour(unclean: Result) -> None:
+def test_a_finding_has_text_beside_colour(unclean: Result) -> None:
     page = render(unclean, ())
-    cells = re.findall(r'<li class="(\w+)"><b>([^<]+)</b>([^<]+)</li>', page)
-    assert [(level, check) for level, check, _ in cells] == [
-        ("ok", "starts agree"), ("ok", "chains converged"), ("fail", "residuals white"), ("warn", "outliers"),
-        ("ok", "linearity"), ("warn", "parameters informed"), ("fail", "stated errors"),
+    cells = re.findall(r'<li><span class="chip (\w+)">([^<]+)</span> <b>([^<]+)</b>', page)
+    words = {"ok": "✓ ok", "warn": "! warning", "fail": "✗ failed"}
+    assert all(words[level] == word for level, word, _ in cells)
+    assert [(level, check) for level, _, check in cells] == [
+        ("fail", "stated errors"), ("warn", "parameters informed"),
+        ("ok", "starts agree"), ("ok", "chains converged"), ("ok", "residuals white"), ("ok", "linearity"),
+        ("fail", "residuals white"), ("warn", "outliers"),
     ]  # fmt: skip
-    words = {"ok": "ok", "warn": "warning", "fail": "failed"}
-    assert all(words[level] in text for level, _, text in cells)
+
+
+def test_what_is_ok_is_one_line(unclean: Result) -> None:
+    """Closed: the number and the titles; opened: the texts."""
+    (part,) = re.findall(r'<details class="passed">(.*?)</details>', render(unclean, ()), re.DOTALL)
+    line, _, opened = part.partition("</summary>")
+    assert Page(line + "</summary>").text == "✓ 4 ok starts agree, chains converged, residuals white, linearity"
+    assert "all 6 starts of the point fit ended at the same maximum" in opened
+    assert "motor_current" in opened
+
+
+def test_a_check_shows_question_number_and_limit(unclean: Result) -> None:
+    text = Page(render(unclean, ())).text
+    assert "Has the sampler converged? R-hat 1.0020, limit 1.01; 61 autocorrelation times, at least 20; " in text
+    assert "Does a reading stand apart? 4.1 sd off (p = 0.0001), limit p = 0.002 over all readings. " in text
+    assert question_of(Finding("decays.halves", "fail", {"name": "k1", "z": 4.25})).startswith(
+        "Do both halves of the record agree? k1: 4.2 sd apart, limit 4"
+    )
+    # The question alone where the number is not among the facts, and nothing for other codes.
+    assert question_of(Finding("decays.halves", "ok", {"labels": "a"})) == "Do both halves of the record agree?"
+    assert question_of(Finding("own", "fail", {"p": 0.1})) == ""
+
+
+def test_the_limits_of_the_questions_are_those_of_the_checks() -> None:
+    assert QUESTIONS.keys() <= messages_of(default_registry()).keys()
+    assert all(text.partition("{")[0].count("?") == 1 for text in QUESTIONS.values())
+    said = {
+        code: set(map(float, re.findall(r"(?<![\w.])\d+(?:\.\d+)?", re.sub(r"{.*?}", "", text))))
+        for code, text in QUESTIONS.items()
+    }
+    limits = {
+        "sample.maximum": {FARTHEST_MAXIMUM}, "priors.tails": {PRIOR_PULL}, "trials.loads": {ORDER_LEVEL},
+        "trials.order": {SMALLEST_CORRELATION, ORDER_LEVEL}, "trials.tables": {ORDER_LEVEL}, "trials.speeds": {ORDER_LEVEL},
+        "bench_and_runs.agree": {AGREEMENT_LEVEL}, "runs.predictable": {LARGEST_GROWTH}, "decays.halves": {FAIL, DISAGREE},
+        "friction.variants": {FACTOR}, "starts.agree": {0.0}, "springs.cantilever": {LEVEL, 3.0},
+    }  # fmt: skip
+    for code, numbers in said.items():
+        assert numbers == limits.get(code, {LEVEL} if numbers else set()), code
+
+
+def before_contents(text: str) -> str:
+    return text.partition("<nav")[0]
+
+
+def with_shares(result: Result, **shares: dict[str, float]) -> Result:
+    return replace(result, point_fit=replace(result.point_fit, shares=shares))
+
+
+def test_page_one_has_the_picture_that_warns_or_convinces(
+    result: Result, unclean: Result, drawn: tuple[Picture, ...]
+) -> None:
+    def first(of: Result) -> tuple[list[str], str]:
+        text = before_contents(render(of, drawn))
+        return re.findall(r'alt="([^.]*)\.', text), Page(text + "</body></html>").text
+
+    titles, text = first(unclean)
+    assert titles == ["Free vibration free_vibration_2"]
+    assert "The worst failed check: residuals white." in text
+    # The one that is least probable; a certain fault before it.
+    more = Finding("outliers", "fail", {**OUTLIER, "p": 1e-40}, "support_spring_stiff")
+    assert first(replace(unclean, findings=(more, *unclean.findings)))[0] == ["Support spring stiff"]
+    certain = Finding("lines.rise", "fail", {}, "motor_current")
+    assert first(replace(unclean, findings=(more, *unclean.findings, certain)))[0] == ["Current against force"]
+    shares = {"k1": {"free_vibration_1": 0.3}, "c": {"free_vibration_1": 0.4}, "K": {"motor_current": 0.6}}
+    titles, text = first(with_shares(result, **shares))
+    assert titles == ["Free vibration free_vibration_1"]
+    assert "No check failed. This experiment informs most of the parameters." in text
+    # A failed check of no experiment: the picture of what informs its parameters.
+    conflict = Finding("sample.modes", "fail", {"name": "K"}, parameters=("K",))
+    titles, text = first(with_shares(replace(result, findings=(conflict,)), **shares))
+    assert titles == ["Current against force"]
+    assert "Failed: maximum and sample. This experiment informs the parameters concerned most." in text
+    assert first(replace(result, comparisons=()))[0] != []
+    assert 'id="picture"' not in render(result, ())
+
+
+def test_a_failed_channel_is_the_picture_of_its_run(result: Result) -> None:
+    """One picture of each experiment; that of the channel that a failed check names, not of the first one."""
+    run = [
+        Picture(f"run_1_{name}", "measured", name, "", 900, 500, b"", group="run_1") for name in ("x_rel", "current")
+    ]
+    assert before_contents(render(result, run)).count('alt="x_rel.') == 1
+    bad = Finding("residuals.white", "fail", {**COLOURED, "record": "run_1 current"}, "run_1")
+    page = render(replace(result, findings=(bad,)), run)
+    assert before_contents(page).count('alt="current.') == 1
+    assert re.search(r"<summary><b>run_1</b> 1 more figure</summary>.*alt=\"x_rel\.", page, re.DOTALL)
+
+
+def test_findings_of_tables_with_a_shared_panel_stand_beside_it(result: Result, drawn: tuple[Picture, ...]) -> None:
+    bad = Finding("outliers", "warn", OUTLIER, "static_friction")
+    page = Page(render(replace(result, rig=read_rig(DATA), findings=(bad,)), drawn)).text
+    assert re.search(r"friction ! warning .{,400}! warning outliers Does a reading stand apart", page)
+
+
+def test_a_table_with_the_name_of_a_check_has_no_findings_of_the_whole_fit(result: Result) -> None:
+    rig = read_rig(DATA)
+    table = replace(rig.tables[0], label="priors")
+    named = replace(result, rig=replace(rig, tables=(table,)), findings=(Finding("priors.tails", "warn", {}),))
+    page = Page(render(named, [Picture("x", "measured", "t", "c", 9, 9, b"", group="priors")])).text
+    assert "The whole fit ! warning" in page
+    assert "priors ✓ ok" in page
+
+
+def test_terms_of_the_questions_are_explained() -> None:
+    words = {"R-hat", "autocorrelation time", "chi-square", "sd", "Pareto shape", "prior", "white", "residual"}
+    asked = " ".join(QUESTIONS.values()).lower()
+    assert all(word.lower() in asked for word in words)
+    assert words <= TERMS.keys()
+
+
+def sketch_of(result: Result) -> str:
+    (svg,) = re.findall(r"<svg.*?</svg>", render(result, ()), re.DOTALL)
+    return " ".join(re.sub(r"<[^>]*>", " ", svg).split())
+
+
+def test_the_sketch_has_the_parts_of_the_fit_with_their_values(result: Result) -> None:
+    rows = {row.name: row.quoted for row in table_rows(result.summary)}
+    sketch = sketch_of(result)
+    for name, symbol in (("k1", "k 1"), ("c", "c"), ("m1", "m 1"), ("m2", "m 2"), ("mu", "μ")):
+        assert f"{symbol} {rows[name]}" in sketch
+    assert "k 2 3 springs" in sketch
+    assert "G" not in sketch
+    springs = replace(result, summary=result.summary.loc[["k2[soft]", "mu"]])
+    assert sketch_of(springs) == f"k 2 {rows['k2[soft]']} N/m μ {rows['mu']}"
+    gone = result.summary.loc[["K", "v_s"]]
+    assert "<svg" not in render(replace(result, summary=gone), ())
 
 
 def test_every_finding_is_there_in_full_worst_first(unclean: Result) -> None:
@@ -149,7 +282,7 @@ def test_a_shared_panel_has_the_level_of_its_checks(result: Result, drawn: tuple
     for level, word in (("fail", "✗ failed"), ("ok", "✓ ok")):
         finding = Finding("friction.variants", level, facts | {"count": 3, "simplest": "eq. (1)"})
         text = Page(render(replace(result, findings=(finding,)), drawn)).text
-        assert f"friction {word} 1 figure" in text
+        assert f"friction {word} Its picture stands on the first page" in text
 
 
 def test_the_methods_paragraph_counts_the_fitted_experiments(result: Result) -> None:
@@ -180,15 +313,17 @@ def test_the_truth_of_a_synthetic_rig_stands_beside_the_estimate(result: Result)
     assert "truth" not in Page(render(result, ())).text
 
 
-def test_few_figures_are_open_at_first(result: Result, drawn: tuple[Picture, ...]) -> None:
-    """Experiments with a failure or a warning are open, up to 9 figures; with the sample's at most 12."""
+def test_one_picture_of_each_experiment_is_open(result: Result, drawn: tuple[Picture, ...]) -> None:
+    """Everything else is in closed parts, and no picture is there twice."""
     bad = tuple(Finding("outliers", "warn", OUTLIER, item.label) for item in result.comparisons)
     for findings in ((), bad):
         page = render(replace(result, findings=findings), (*drawn, *drawn))
-        opened = [part for part in re.split(r"(?=<details)", page) if part.startswith("<details") and " open>" in part]
-        assert sum(part.partition("</details>")[0].count("<img") for part in opened) <= 12
+        assert not re.search(r"<details[^>]* open", page)
+        shown = re.sub(r"<details.*?</details>", "", page, flags=re.DOTALL)
+        assert shown.count("<img") == len({picture.group for picture in drawn} - {""})
         assert page.count("<img") == 2 * len(drawn)
-    assert 'details id="experiment-1" open' in page
+    tables = re.sub(r"<details.*?</details>", "", page, flags=re.DOTALL).count("<table")
+    assert tables == 1
 
 
 def test_alternative_texts_say_what_is_seen(drawn: tuple[Picture, ...]) -> None:

@@ -1,6 +1,7 @@
 """No text of a figure leaves the picture or lies on another one: boxes measured by matplotlib's renderer."""
 
 import itertools
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -11,8 +12,11 @@ from matplotlib.legend import Legend
 from matplotlib.text import Text
 
 from capsule_id.inference.result import Result
-from capsule_id.report.figures.style import figure_of, new_axes, set_legend
+from capsule_id.report.columns import sampled_parameters
+from capsule_id.report.figures.fits import comparison_figure, corner, corner_size
+from capsule_id.report.figures.style import figure_of, new_axes, new_figure, set_legend
 from capsule_id.report.html import drawings
+from tests.report.test_figures import forced_run
 
 #: Boxes may share this much, pixels: a renderer rounds.
 SLACK = 1.0
@@ -70,6 +74,18 @@ def test_texts_of_every_figure_are_apart(result: Result) -> None:
     found = {name: faults(figure) for name, _, _, _, figure, *_ in drawings(result)}
     assert {"corner", "traces", "point_fit_starts", "friction", "free_vibration_1"} < set(found)
     assert {name: fault for name, fault in found.items() if fault} == {}
+
+
+def test_texts_of_a_forced_run_and_of_a_large_corner_plot_are_apart(result: Result) -> None:
+    assert faults(comparison_figure(forced_run())) == []
+    columns = sampled_parameters(result)
+    # Round numbers at both ends of every axis: they lay on those of the next panel.
+    shifted = replace(
+        columns, draws=np.broadcast_to(np.linspace(1420.0, 1423.2, 9)[:, None, None], (1, 9, 1, len(columns.names)))
+    )
+    corner(shifted, figure := new_figure(*corner_size(shifted)))
+    assert len(columns.names) > 8
+    assert faults(figure) == []
 
 
 def test_overlaps_and_clipped_texts_would_be_found() -> None:

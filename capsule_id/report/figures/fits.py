@@ -4,6 +4,7 @@ A panel is ``(data, ax)`` and draws into ``ax``; labels are plain text.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from scipy import ndimage
+from scipy import ndimage, signal
 
 from capsule_id.inference.result import PointFit
 from capsule_id.parameters import QUANTILE_975
@@ -38,7 +39,7 @@ from capsule_id.report.figures.style import (
     set_text,
 )
 from capsule_id.rig.model import Table
-from capsule_id.views import Comparison, Curve, Finding, Points, with_unit
+from capsule_id.views import Comparison, Curve, Finding, Points, counted, with_unit
 
 # comparisons: Measured beside predicted: the panels of a ``Comparison``, and where the point fit's starts ended.
 
@@ -118,15 +119,82 @@ def _largest(values: np.ndarray) -> float:
 
 
 def comparison_figure(item: Comparison) -> Figure:
-    """The panel of a comparison over the residual and autocorrelation panels that it has."""
+    """The panel of a comparison over the residual and autocorrelation panels that it has.
+
+    A record of many periods covers its curve: it has its range in each period, and beside it three periods in full.
+    """
     below = [residuals] * (item.residuals is not None) + [autocorrelation] * (item.autocorrelation is not None)
     figure = new_figure(9.0 if item.autocorrelation is not None else 6.4, 5.6)
-    grid = figure.add_gridspec(2, max(len(below), 1), height_ratios=(1.7, 1.0), hspace=0.38, wspace=0.25)
-    top = figure.add_subplot(grid[0, :] if below else grid[:, :])
-    comparison(item, top)
+    period = period_of(item)
+    look: dict[str, Any] = {"height_ratios": (1.7, 1.0), "width_ratios": (1.0, 1.4) if period else None}
+    grid = figure.add_gridspec(2, max(len(below), 1), hspace=0.38, wspace=0.25, **look)
+    top = figure.add_subplot(grid[0, 0] if period else grid[0, :] if below else grid[:, :])
+    if period:
+        ranges(item, period, top)
+        comparison(worst_periods(item, period), figure.add_subplot(grid[0, 1]))
+    else:
+        comparison(item, top)
     for column, panel in enumerate(below):
         panel(item, figure.add_subplot(grid[1, column], sharex=top if panel is residuals else None))
     return figure
+
+
+#: Periods drawn in full, fewest periods of a record that has them, and smallest correlation of neighbouring periods.
+PERIODS_IN_FULL, FEWEST_PERIODS, ALIKE = 3, 6, 0.8
+
+
+def period_of(item: Comparison) -> int:
+    """Samples in a period of a long record whose fitted motion repeats; 0 for any other comparison."""
+    curve, n = item.curves[0].y if item.curves else np.zeros(0), item.points[0].y.size
+    if (
+        item.autocorrelation is None
+        or item.residuals is None
+        or n <= _MANY
+        or not curve.size == item.residuals.size == n
+    ):
+        return 0
+    lags = np.arange(n // FEWEST_PERIODS)
+    power = np.abs(np.fft.rfft(signal.detrend(curve), 2 * n)) ** 2
+    similar = np.fft.irfft(power)[lags] / (n - lags)
+    # Beyond the first sign change; the first of the lags that are nearly as good, since multiples of the period are too.
+    later = similar[np.argmax(similar < 0.0) :] if np.any(similar < 0.0) else np.zeros(1)
+    if not np.max(later) >= ALIKE * similar[0] > 0.0:
+        return 0
+    good = np.flatnonzero(similar >= 0.95 * np.max(later))
+    good = good[good >= lags.size - later.size]
+    first = good[: np.argmax(np.diff(good, append=n) > 1) + 1]
+    return int(first[np.argmax(similar[first])])
+
+
+def worst_periods(item: Comparison, period: int) -> Comparison:
+    """The part of a record with the largest residuals, ``PERIODS_IN_FULL`` periods long."""
+    assert item.residuals is not None
+    length = PERIODS_IN_FULL * period
+    sums = np.cumsum(np.append(0.0, item.residuals**2))
+    start = int(np.argmax(sums[length:] - sums[:-length]))
+
+    def cut(part: Any) -> Any:
+        arrays = {key: x[start : start + length] for key, x in vars(part).items() if isinstance(x, np.ndarray)}
+        return replace(part, **arrays)
+
+    points, curves = tuple(map(cut, item.points)), tuple(map(cut, item.curves))
+    title = f"{counted(PERIODS_IN_FULL, 'period')} with the largest residuals"
+    return replace(item, title=title, y_label="", points=points, curves=curves, residuals=None, autocorrelation=None)
+
+
+def ranges(item: Comparison, period: int, ax: Axes) -> None:
+    """Smallest and largest value in each period, of record and curve, against the first coordinate."""
+    points, curve = item.points[0], item.curves[0]
+    starts = np.arange(0, points.x.size - period + 1, period)
+    (low, high), fitted = (
+        [np.array([edge(y[i : i + period]) for i in starts]) for edge in (np.min, np.max)] for y in (points.y, curve.y)
+    )
+    x = points.x[starts + period // 2]
+    ax.fill_between(x, low, high, color=GREY, alpha=0.35, lw=0, label="range of the record")
+    for edge, label in zip(fitted, (f"range of {curve.label}", ""), strict=True):
+        ax.plot(x, edge, label=label, **_CURVE_STYLES[curve.role])
+    set_text(ax, item.x_label, item.y_label, item.title)
+    set_legend(ax, "upper right")
 
 
 def side_by_side(items: Sequence[Comparison]) -> Figure:
@@ -187,7 +255,7 @@ def _draw_curve(ax: Axes, curve: Curve, band_label: str | None, over_cloud: bool
 
 def _draw_points(ax: Axes, points: Points) -> None:
     if points.x.size > _MANY:
-        ax.plot(points.x, points.y, ls="", marker=".", ms=3.5, color=GREY, label=points.label, zorder=2)
+        ax.plot(points.x, points.y, ls="", marker=".", ms=2.5, color=GREY, label=points.label, zorder=2)
     else:
         style = {"ms": 6.5, "mew": 1.4, "elinewidth": 1.1, "zorder": 4, **_POINT_STYLES[points.role]}
         ax.errorbar(points.x, points.y, points.y_error, ls="", label=points.label, **style)
@@ -367,7 +435,7 @@ def corner_size(columns: SampledParameters) -> tuple[float, float]:
     n = len(columns.names)
     panels = n * (2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n)))
     # The key stands in the empty upper triangle, or above the panels where that is too small.
-    return 1.6 + panels, 1.25 + panels + (0.9 if n <= 2 else 0.0)
+    return 1.6 + panels, 1.25 + panels + (0.9 if n <= 2 else 0.0) + (0.25 if n > 4 else 0.0)
 
 
 def corner(columns: SampledParameters, figure: Figure | SubFigure) -> None:
@@ -376,7 +444,7 @@ def corner(columns: SampledParameters, figure: Figure | SubFigure) -> None:
     The point fit is marked in black, the paper's estimate, where it lies in the picture, in vermilion.
     """
     n, flat = len(columns.names), columns.draws.reshape(-1, len(columns.names))
-    set_margins(figure, left=1.25, right=0.35, bottom=1.0, top=1.15 if n <= 2 else 0.25)
+    set_margins(figure, left=1.25, right=0.35, bottom=1.25 if n > 4 else 1.0, top=1.15 if n <= 2 else 0.25)
     grid, ends = figure.add_gridspec(n, n, wspace=0.06, hspace=0.06), _ends(columns)
     for i, j in ((row, column) for row in range(n) for column in range(row + 1)):
         ax = figure.add_subplot(grid[i, j], xticks=[], yticks=[])
@@ -396,14 +464,16 @@ def corner(columns: SampledParameters, figure: Figure | SubFigure) -> None:
         ax.set_xlim(*ends[j])
         for axis, k, shown in ((ax.xaxis, j, i == n - 1), (ax.yaxis, i, j == 0 < i)):
             if shown:
-                axis.set_major_locator(MaxNLocator(4, prune="both"))
+                ticks, middle = MaxNLocator(5).tick_values(*ends[k]), np.mean(ends[k])
+                # Those at the edges would touch the next panel's.
+                axis.set_ticks(ticks[np.abs(ticks - middle) < 0.42 * np.ptp(ends[k])])
                 axis.set_label_text(
                     with_unit(columns.symbols[k], columns.units[k]).replace(", ", ",\n"),
                     fontsize=TEXT,
                     parse_math=False,
                 )
         ax.tick_params(labelsize=SMALL - 0.5, length=3)
-        ax.tick_params("x", labelrotation=40)
+        ax.tick_params("x", labelrotation=40 if n <= 4 else 90)
         ax.ticklabel_format(useOffset=False, style="plain")
     figure.align_labels()
     key = (

@@ -1,4 +1,4 @@
-// Sorts a table by the column of the pressed button, opens all parts before printing, copies a text.
+// Sorts a table by the column of the pressed button, copies a text, opens the part that a link leads to.
 for (const button of document.querySelectorAll("th button")) {
   button.addEventListener("click", () => {
     const cell = button.parentElement, table = cell.closest("table"), body = table.tBodies[0];
@@ -15,11 +15,12 @@ for (const button of document.querySelectorAll("th button")) {
     body.append(...rows);
   });
 }
-addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(part => { part.open = true; }));
 for (const button of document.querySelectorAll("button.copy")) {
   button.addEventListener("click", () => {
     getSelection().selectAllChildren(document.getElementById(button.value));
     document.execCommand("copy");
   });
 }
-addEventListener("hashchange", () => document.getElementById(location.hash.slice(1))?.closest("details")?.setAttribute("open", ""));
+const reveal = () => document.getElementById(location.hash.slice(1))?.closest("details")?.setAttribute("open", "");
+addEventListener("hashchange", reveal);
+reveal();
