@@ -45,6 +45,7 @@ NOT_OPTIMISED = {
     "test_displacement.py",
     "test_exact_derivatives.py",
     "test_exact_truths.py",
+    "test_feasibility.py",
     "test_forced_run.py",
     "test_forces.py",
     "test_foreign_law.py",
