@@ -58,6 +58,7 @@ NOT_OPTIMISED = {
     "test_heavy_tails.py",
     "test_hidden_terms.py",
     "test_likelihoods.py",
+    "test_measured_runs.py",
     "test_misfit.py",
     "test_point_stage.py",
     "test_predictability.py",
