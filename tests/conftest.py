@@ -34,6 +34,7 @@ NOT_OPTIMISED = {
     "test_base_run.py",
     "test_bifurcate_command.py",
     "test_block_means.py",
+    "test_blocks.py",
     "test_capsule_bench.py",
     "test_choice.py",
     "test_clock_drift.py",

@@ -132,13 +132,17 @@ def fresh(seed: int) -> list[tuple[np.ndarray, np.ndarray, float, int]]:
     return found
 
 
-@cache
 def reference(repeated: bool = False, only: str = "") -> tuple[Known, ...]:
-    """The 25 reference cases, each as one record.
+    """The 25 reference cases, each as one record, made once.
 
     repeated : with a whole number of samples in an excitation period
     only : the name of one case
     """
+    return _reference(repeated, only)
+
+
+@cache
+def _reference(repeated: bool, only: str) -> tuple[Known, ...]:
     known = []
     for seed, case in enumerate(read_cases().raw):
         if only not in ("", case["name"]):

@@ -125,7 +125,7 @@ def outcome(folder: Path, name: str, summary: pd.DataFrame, capsys: pytest.Captu
     ("seed", "times"),
     [
         (0, 2 * len(DAMAGES)),
-        pytest.param(1, 700, marks=pytest.mark.full),
+        pytest.param(1, 280, marks=pytest.mark.full),
         pytest.param(1, 3000, marks=[pytest.mark.full, pytest.mark.slow]),
     ],
 )
