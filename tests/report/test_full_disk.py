@@ -212,7 +212,7 @@ MAP += ("--with-to", "6", "--with-points", "2", "--dropped", "20", "--observed",
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("every", [9, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("error", [Killed, partial(OSError, errno.ENOSPC, os.strerror(errno.ENOSPC))])
 def test_a_fault_at_every_operation_of_a_map(
     tmp_path: Path,
