@@ -13,7 +13,6 @@ from bisect import bisect_left
 import numpy as np
 from jaxtyping import Float, Int, Num
 from numpy.polynomial import legendre
-from scipy import signal
 
 from capsule_id.errors import InputError
 from capsule_id.views import counted
@@ -225,8 +224,11 @@ def dominant_frequency(time: Record, values: Record) -> float:
 
 def _highest_peak(values: Record, step: float) -> float:
     """Frequency of the highest peak of the spectrum, Hz, of samples at distances of ``step``, s."""
+    # Its import takes four times as long as the rest of a process that reads one binary file.
+    from scipy.signal import detrend
+
     length = _ZERO_PADDING * len(values)
-    spectrum = np.abs(np.fft.rfft(signal.detrend(values), length))
+    spectrum = np.abs(np.fft.rfft(detrend(values), length))
     # Below 1 / duration a peak is a remainder of the trend.
     return float(np.fft.rfftfreq(length, step)[_ZERO_PADDING + int(np.argmax(spectrum[_ZERO_PADDING:]))])
 

@@ -106,11 +106,11 @@ def test_an_ensemble_never_repeats_itself(here: Path) -> None:
     ("stage", "draws"),
     [
         pytest.param("point fit", 0, marks=pytest.mark.full),
-        ("pilot", 0),
+        pytest.param("pilot", 0, marks=pytest.mark.full),
         pytest.param("e", 1, marks=pytest.mark.slow),
         ("e", 35),
         pytest.param("e", 100, marks=pytest.mark.slow),
-        ("report", 0),
+        pytest.param("report", 0, marks=pytest.mark.full),
     ],
 )
 def test_interrupted_and_resumed(

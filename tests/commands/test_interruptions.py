@@ -116,6 +116,7 @@ def test_a_step_that_does_not_end_is_ended(tmp_path: Path) -> None:
     ] == "fit-params: interrupted; --resume continues from the saved state"
 
 
+@pytest.mark.full
 def test_a_worker_thread_that_does_not_end_is_ended(tmp_path: Path) -> None:
     """The main thread ends at once; Python would then wait for the worker."""
     small_rig(tmp_path / "rig")

@@ -95,6 +95,7 @@ def test_a_shaken_capsule_is_identified(tmp_path: Path) -> None:
         assert sds[name] < 0.05 * truth
 
 
+@pytest.mark.full
 def test_the_portrait_of_a_shaken_run_needs_no_mass_of_the_rod(tmp_path: Path) -> None:
     """With a spring in reach, and a normal force that makes the mass of the rod unknown."""
     own = entry(spring='"L60"', gap=quantity(20.0, "mm"))

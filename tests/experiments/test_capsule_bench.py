@@ -144,6 +144,7 @@ def test_pushes_read_by_the_closed_form_are_biased() -> None:
     assert mu["closed"] > 1.03 * MU
 
 
+@pytest.mark.full
 def test_the_smoothed_model_converges_to_the_exact_one() -> None:
     e = CapsulePushes(pushes("capsule"), bench.rig())
     exact = np.asarray(e.predict(TRUTH, e.readings))

@@ -56,6 +56,8 @@ CASES = {
     "run with a recorded drive": lambda time: run_table(time, drive="recorded"),
     "run of a shaken base": lambda time: run_table(time, drive="base"),
 }  # fmt: skip
+#: One of each way to read the times.
+CORE = ("decay", "turning points", "run")
 
 
 def restated(table: Table, drift: Quantity) -> Table:
@@ -80,7 +82,9 @@ def theta_of(e: Experiment) -> dict[str, float]:
     }
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize(
+    "name", [*CORE, *(pytest.param(one, marks=pytest.mark.full) for one in CASES if one not in CORE)]
+)
 def test_the_drift_stretches_the_record(name: str) -> None:
     """The likelihood at a drift is that of the record whose times were read with this drift, stated as exact."""
     table = CASES[name](TIME)

@@ -11,16 +11,16 @@ from scipy.signal import lfilter
 
 from capsule_id.api import fit
 from capsule_id.experiments.base import LEVEL
-from capsule_id.experiments.forced_run.drives import FEWEST_PERIODS, BaseRun, repetition
+from capsule_id.experiments.forced_run.drives import FEWEST_PERIODS, BaseRun, ForcedRun, repetition
 from capsule_id.experiments.friction_model import FrictionModel
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference import point_stage as second_fits
 from capsule_id.inference.point_stage import error_of_sum, fit_points, law_of_runs
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
-from capsule_id.rig.model import Rig
+from capsule_id.rig.model import Quantity, Rig
 from capsule_id.views import Finding
-from tests import forced_runs
+from tests.experiments import bench
 from tests.experiments.test_base_run import BASE, M2, TRUTH, N, base
 from tests.measured.folders import Entry, make_rig, quantity
 from tests.scipy_general import simulate_general
@@ -68,8 +68,11 @@ def test_coloured_noise_starts_at_the_correlation_of_the_residuals(tmp_path: Pat
 
 def test_a_run_says_whether_it_has_a_spring_and_which_noise_is_stated(tmp_path: Path) -> None:
     """The remedies of its findings name no spring where there is none."""
-    rig = shaken(tmp_path, 0.0, noise='"white"')
-    facts = [run.noise_facts() for run in (BaseRun(rig.tables[0], rig), forced_runs.make(1))]
+    rig, time = shaken(tmp_path, 0.0, noise='"white"'), np.arange(120) / 1000.0
+    columns = [bench.column("time", time), bench.column("x_rel", 1e-3 * np.cos(35.0 * time))]
+    contacts = {"spring": "stiff", "gap": Quantity(1e-3, 2e-5), "Omega": 35.0, "P_d": Quantity(4.0)}
+    driven = bench.table("forced_run", columns, **contacts)
+    facts = [run.noise_facts() for run in (BaseRun(rig.tables[0], rig), ForcedRun(driven, bench.rig(driven)))]
     assert [(one["spring"], one["noise"]) for one in facts] == [(False, "white"), (True, None)]
 
 

@@ -190,6 +190,12 @@ def test_halves_of_a_decay_with_dry_friction_name_the_damping() -> None:
     assert finding.facts["second"] > finding.facts["first"]
 
 
+def test_halves_of_a_decay_on_a_hardening_spring_name_the_stiffness_that_falls() -> None:
+    (finding,) = halves({**VISCOUS, "k_cubic": 0.05 * bench.K1 / RELEASE**2}, 1)
+    assert (finding.level, finding.facts["name"]) == ("fail", "k1")
+    assert finding.facts["second"] < finding.facts["first"]
+
+
 def text(finding: Finding) -> str:
     return finding_text(finding, messages_of(default_registry()))
 

@@ -40,6 +40,7 @@ def test_slope_is_unbiased_under_errors_in_both_columns() -> None:
     assert np.mean(found) == pytest.approx(K, abs=3.0 * error)
 
 
+@pytest.mark.full
 def test_a_prior_flat_in_the_current_would_bias_it() -> None:
     """Negative control: low by (sd_x / sd of the currents)^2 = 6 %, as ordinary least squares."""
     found = slopes(300, along=False)

@@ -88,6 +88,7 @@ def test_the_likelihood_is_that_of_plain_runs(folder: Path) -> None:
         assert e.profile(THETA)(other) == pytest.approx(changed, abs=error * abs(changed - expected))
 
 
+@pytest.mark.full
 def test_the_smoothed_engine_moves_the_trials_as_the_exact_one_does(folder: Path) -> None:
     """Within the 2 % that the widths are certified for. Much wider ones move them by more: the negative control."""
     text = (folder / "rig.toml").read_text(encoding="utf-8")

@@ -176,6 +176,7 @@ def test_an_outlying_trial_is_found(tmp_path: Path, sessions: int) -> None:
         assert [one.row for one in found] == ([] if row is None else [row])
 
 
+@pytest.mark.full
 def test_an_outlying_trial_is_found_where_no_parameter_has_an_effect(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -80,8 +80,13 @@ def test_false_alarms_are_rare() -> None:
         pytest.param(0.0, DRY, DecayModel(("dry",)), marks=pytest.mark.slow),
         (0.0, {"c_q": 10.0}, DecayModel(("quadratic",))),
         pytest.param(0.0, {"k_cubic": 0.03 * bench.K1 / RELEASE**2}, DecayModel(cubic=True), marks=pytest.mark.slow),
-        (0.0, {**DRY, "k_cubic": -0.03 * bench.K1 / RELEASE**2}, DecayModel(("dry",), cubic=True)),
-        (20.0 * TIME, {}, DecayModel(drift="linear")),
+        pytest.param(
+            0.0,
+            {**DRY, "k_cubic": -0.03 * bench.K1 / RELEASE**2},
+            DecayModel(("dry",), cubic=True),
+            marks=pytest.mark.full,
+        ),
+        pytest.param(20.0 * TIME, {}, DecayModel(drift="linear"), marks=pytest.mark.full),
         (10.0 * np.sin(6.0 * TIME), {}, DecayModel(drift="gp")),
     ],
     ids=["dry", "quadratic", "cubic", "dry and cubic", "linear drift", "drift"],
@@ -140,6 +145,7 @@ def test_coloured_noise_is_found() -> None:
     assert second.model.symbols == ()
 
 
+@pytest.mark.full
 def test_coloured_noise_is_quoted_from_fewer_readings_that_tell_as_much() -> None:
     """2000 samples of eight periods: block means of 13 samples give the standard errors to 6 %. (Before: 16 times the cost.)"""
     time, rng = np.arange(2000) / 4000.0, np.random.default_rng(4)

@@ -48,8 +48,10 @@ FORMATS: Mapping[str, Callable[[Columns], bytes]] = {
 }
 #: Formats whose first channel is a time, and those whose names are identifiers, without units.
 CLOCKED, BARE = ("lvm", "tdms"), ("mat",)
+#: Each kind from one format in the core, from another one in full.
+TIERS = {0: [], 5: pytest.mark.full}
 CASES = [
-    pytest.param(kind, suffix, marks=[] if (j - k) % len(FORMATS) in (0, 5) else pytest.mark.slow)
+    pytest.param(kind, suffix, marks=TIERS.get((j - k) % len(FORMATS), pytest.mark.slow))
     for k, kind in enumerate([*FILES, *OTHERS])
     for j, suffix in enumerate(FORMATS)
 ]

@@ -27,7 +27,7 @@ BUDGET = 40
 
 
 def test_stages_one_by_one_give_the_numbers_of_the_whole(tmp_path: Path) -> None:
-    folder = small_rig(tmp_path / "rig", tables=("motor_current", "support_spring_soft"))
+    folder = small_rig(tmp_path / "rig", tables=("motor_current",))
     kinds = default_registry()
     rig = cid.read_rig(folder, kinds)
     seeds = stage_seeds(3)

@@ -21,17 +21,21 @@ P = CapsuleParameters(m1=0.074, m2=0.193, k1=250.0, k2=0.0, c=0.5, mu=0.28, v_s=
 TOLERANCE = 1e-6
 
 
-def test_it_is_the_end_of_a_plain_run() -> None:
-    for drive in (
+@pytest.mark.parametrize(
+    "drive",
+    [
         Pulses(P_on=-1.2, period=PERIOD, duty=0.3, lag=0.008, reaction=1.0),
-        Excitation(P_d=1.5, Omega=2.0 * np.pi / PERIOD),
-    ):
-        times = np.stack([np.zeros(5), PERIOD * COUNT], axis=1)
-        plain = simulate(P, drive, times, (1e-3, 0.0, 0.0, 0.0))
-        found = displacement(P, drive, friction_law(P), PERIOD, COUNT, 1e-3)
-        assert np.ptp(np.asarray(plain.X2)[:, -1]) > 5e-3
-        np.testing.assert_allclose(found.X2, np.asarray(plain.X2)[:, -1], rtol=0.0, atol=TOLERANCE)
-        np.testing.assert_array_equal(found.status, plain.status)
+        pytest.param(Excitation(P_d=1.5, Omega=2.0 * np.pi / PERIOD), marks=pytest.mark.full),
+    ],
+    ids=["pulses", "harmonic"],
+)
+def test_it_is_the_end_of_a_plain_run(drive: Pulses | Excitation) -> None:
+    times = np.stack([np.zeros(5), PERIOD * COUNT], axis=1)
+    plain = simulate(P, drive, times, (1e-3, 0.0, 0.0, 0.0))
+    found = displacement(P, drive, friction_law(P), PERIOD, COUNT, 1e-3)
+    assert np.ptp(np.asarray(plain.X2)[:, -1]) > 5e-3
+    np.testing.assert_allclose(found.X2, np.asarray(plain.X2)[:, -1], rtol=0.0, atol=TOLERANCE)
+    np.testing.assert_array_equal(found.status, plain.status)
 
 
 @pytest.mark.full

@@ -99,7 +99,9 @@ def test_without_friction_rod_and_capsule_are_a_linear_oscillator() -> None:
     np.testing.assert_allclose(states_of(t)[:, [1, 3]], expected[:, [1, 3]], rtol=0.0, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", ["fig6_k2_1", "fig10_Om_26.58", "fig11_Pd_1.2"])
+@pytest.mark.parametrize(
+    "name", ["fig6_k2_1", *(pytest.param(one, marks=pytest.mark.full) for one in ("fig10_Om_26.58", "fig11_Pd_1.2"))]
+)
 def test_energy_is_balanced_over_a_hundred_periods(cases: Cases, name: str) -> None:
     p, e, T = cases.one(name)
     balance = energy_balance(p, e, (0.0, 100.0 * T))

@@ -96,7 +96,9 @@ def in_a_batch(law: FrictionLaw) -> FrictionLaw:
 LORENTZIAN, EXPONENTIAL = TwoWay(), TwoWay(3.1, 2.2, 0.1, 1.5, 1.4, 0.0)
 
 
-@pytest.mark.parametrize("law", [LORENTZIAN, EXPONENTIAL], ids=["Lorentzian", "exponential"])
+@pytest.mark.parametrize(
+    "law", [LORENTZIAN, pytest.param(EXPONENTIAL, marks=pytest.mark.full)], ids=["Lorentzian", "exponential"]
+)
 def test_another_law_against_scipy(law: TwoWay) -> None:
     def forward(speed: float) -> float:
         ratio = speed / law.v_0

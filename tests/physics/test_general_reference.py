@@ -1,5 +1,7 @@
 """The general capsule against 30 solutions of another program: all drives, all terms."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -17,7 +19,9 @@ SMOOTH_EXCEPTIONS = {"public-06", "public-13"}
 OTHERS = ("harmonic", "recorded")
 
 
-@pytest.mark.parametrize("kind", DRIVES)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.full) if kind == "harmonic" else kind for kind in DRIVES]
+)
 def test_every_period_end_of_every_case(kind: str) -> None:
     batch = read_general_cases(kind)
     t = simulate(batch.p, batch.e, batch.times, batch.initial)
@@ -54,7 +58,13 @@ def test_smooth_engine_has_the_mean_velocity(kind: str) -> None:
     assert error.max() < 0.031
 
 
-def test_a_prescribed_rod_against_scipy() -> None:
+@pytest.mark.parametrize(
+    ("model", "position_bar", "velocity_bar"),
+    [("exact", 1e-9, 1e-7), pytest.param("smooth", 2e-5, 2e-2, marks=pytest.mark.full)],
+)
+def test_a_prescribed_rod_against_scipy(
+    model: Literal["exact", "smooth"], position_bar: float, velocity_bar: float
+) -> None:
     """Every term of the capsule, the rod on a spline through 31 points; m1 counts for the normal force alone."""
     knots = np.linspace(0.0, 0.6, 31)
     position = 2.5e-3 * np.sin(35.0 * knots)
@@ -66,12 +76,10 @@ def test_a_prescribed_rod_against_scipy() -> None:
     drive = (lambda t, on: 0.0), list(knots[1:])
     q = {**vars(p), "reaction": 0.0}
     expected, contacts = simulate_general(q, drive, times, 1e-11, 1e-14, rod=CubicSpline(knots, position))
-    for model, position_bar, velocity_bar in (("exact", 1e-9, 1e-7), ("smooth", 2e-5, 2e-2)):
-        t = simulate(p, RodMotion.through(knots, position), times, model=model)
-        error = np.abs(states_of(t) - expected).max(axis=0)
-        assert error[[0, 2]].max() < position_bar, model
-        assert error[[1, 3]].max() < velocity_bar, model
-        assert int(t.contacts) == contacts
-        assert contacts > 3
+    t = simulate(p, RodMotion.through(knots, position), times, model=model)
+    error = np.abs(states_of(t) - expected).max(axis=0)
+    assert error[[0, 2]].max() < position_bar
+    assert error[[1, 3]].max() < velocity_bar
+    assert int(t.contacts) == contacts > 3
     # The rod follows the record, and starts from it whatever the initial state says.
     np.testing.assert_allclose(t.X1[0], position[0], atol=1e-15)

@@ -42,6 +42,7 @@ def test_default_widths_are_certified_on_every_reference_case(cases: Cases) -> N
     np.testing.assert_array_equal(t.contacts, cases.contacts)
 
 
+@pytest.mark.full
 def test_wide_switch_fails_the_bar(cases: Cases) -> None:
     error = _mean_velocity_error(cases, replace(Smoothing(), velocity=1e-2))
     assert (error > 1.0).sum() > 15

@@ -132,11 +132,21 @@ def fresh(seed: int) -> list[tuple[np.ndarray, np.ndarray, float, int]]:
     return found
 
 
+def reference(repeated: bool = False, only: str = "") -> tuple[Known, ...]:
+    """The 25 reference cases, each as one record, made once.
+
+    repeated : with a whole number of samples in an excitation period
+    only : the name of one case
+    """
+    return _reference(repeated, only)
+
+
 @cache
-def reference(repeated: bool = False) -> tuple[Known, ...]:
-    """The 25 reference cases, each as one record; ``repeated``: with a whole number of samples in an excitation period."""
+def _reference(repeated: bool, only: str) -> tuple[Known, ...]:
     known = []
     for seed, case in enumerate(read_cases().raw):
+        if only not in ("", case["name"]):
+            continue
         parameters = {name: case[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
         T = 2.0 * np.pi / case["Omega"]
         step = T / round(T / 1e-3) if repeated else 1e-3

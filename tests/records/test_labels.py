@@ -112,8 +112,11 @@ def scattered_outcomes(cases: tuple[Known, ...], seed: int) -> list[str]:
     return [outcome(motion.label, case.label) for case, motion in zip(cases, motions, strict=True)]
 
 
-def test_cycles_that_scatter_by_one_percent_have_their_label() -> None:
-    found = scattered_outcomes((*reference()[::3], *longer()[:3]), 0)
+@pytest.mark.parametrize(
+    ("every", "more"), [(8, 0), pytest.param(3, 3, marks=pytest.mark.full)], ids=["four motions", "twelve motions"]
+)
+def test_cycles_that_scatter_by_one_percent_have_their_label(every: int, more: int) -> None:
+    found = scattered_outcomes((*reference()[::every], *(longer()[:more] if more else ())), 0)
     assert [one for one in found if one not in ("right", "period", UNDECIDED)] == []
     assert found.count(UNDECIDED) <= 1
 

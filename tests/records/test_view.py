@@ -23,7 +23,8 @@ KINDS = default_registry()
 
 @pytest.fixture(scope="module")
 def case() -> Known:
-    return next(case for case in reference() if case.name == "fig11_Pd_1.2")
+    (one,) = reference(only="fig11_Pd_1.2")
+    return one
 
 
 @pytest.fixture(scope="module")

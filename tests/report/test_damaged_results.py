@@ -124,8 +124,8 @@ def outcome(folder: Path, name: str, summary: pd.DataFrame, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("seed", "times"),
     [
-        (0, 112),
-        pytest.param(1, 700, marks=pytest.mark.full),
+        (0, 2 * len(DAMAGES)),
+        pytest.param(1, 280, marks=pytest.mark.full),
         pytest.param(1, 3000, marks=[pytest.mark.full, pytest.mark.slow]),
     ],
 )

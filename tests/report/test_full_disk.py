@@ -172,11 +172,11 @@ def fit_params_in(folder: Path, *words: str) -> int:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [12, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_fault_at_every_operation_of_a_fit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], every: int
 ) -> None:
-    """At every fourth one, and at all of them in the study."""
+    """At every twelfth one, and at all of them in the study."""
     small_rig(tmp_path / "rig")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("capsule_id.inference.moves.SAVE_EVERY", np.inf)  # the operations are then the same

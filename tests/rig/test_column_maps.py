@@ -223,12 +223,7 @@ def test_matlab_files_are_merged_by_name(tmp_path: Path) -> None:
     savemat(tmp_path / "s_y.mat", {"y": y[:-1]})
     fault = fault_of(tmp_path, {}, f'files = ["s_x.mat", "s_y.mat"]\n{source}')
     assert "equal lengths" in fault.rule
-    for content in (
-        b"",
-        b"MATLAB 5.0 MAT-file" + bytes(200),
-        b"\x89HDF\r\n",
-        (tmp_path / "s_x.mat").read_bytes()[:200],
-    ):
+    for content in (b"", (tmp_path / "s_x.mat").read_bytes()[:200]):
         assert fault_of(tmp_path, {"s_x.mat": content}, f'file = "s_x.mat"\n{BY_NAME}').file.endswith("s_x.mat")
 
 

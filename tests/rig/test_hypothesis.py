@@ -14,7 +14,7 @@ from capsule_id.rig.formats import EXPORTS, READERS
 from capsule_id.rig.formats.raw import Layout
 
 #: The same examples in every run.
-QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=80)
+QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=40)
 KEYS = (
     "columns", "data_from_line", "data_to_line", "missing", "decimal", "where", "files", "reject", "clock", "plateaus", "label",
     "file", "kind", "x_rel_sd", "start", "stop", "spring", "gap", "damping", "smoothing_window", "capsule",

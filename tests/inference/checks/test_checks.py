@@ -89,6 +89,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> list[Finding]:
     return findings(tmp_path_factory.mktemp("clean") / "rig")
 
 
+@pytest.mark.full
 def test_a_clean_rig_fails_nothing(clean: list[Finding]) -> None:
     assert [f for f in clean if f.level == "fail"] == []
     assert [f.code for f in clean if f.level == "warn"] == ["chains.converged"]  # no sample was drawn

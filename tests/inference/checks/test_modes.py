@@ -125,7 +125,7 @@ def test_two_modes_fail_with_their_weights(tmp_path: Path) -> None:
     rig = sliding(tmp_path, np.array([0.1, 0.2, 0.4]), np.array([0.4, 0.35, 0.3]))
     target = LogPosterior(rig, make_experiments(rig))
     fit = point_fit(target, 0, 2)
-    fitted = sample_posterior(fit_points(target, default_registry(), 0, sampled=True), 0, budget=200)
+    fitted = sample_posterior(fit_points(target, default_registry(), 0, sampled=True), 0, budget=20)
     draws = np.exp(fit.u + 0.1 * np.random.default_rng(0).standard_normal((2, 500, 4, target.dimension)))
     draws[..., :2, target.names.index("mu")] *= 3.0
     posterior = replace(cast(Posterior, fitted.posterior), draws=draws, ess=np.full(target.dimension, 1000.0))

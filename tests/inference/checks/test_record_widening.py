@@ -85,6 +85,7 @@ def test_intervals_cover_under_a_misfit_that_repeats(known: SampledFit) -> None:
     assert np.mean(pulls(known, 5.0, (by_time,))[1] < 1.0) < 0.7
 
 
+@pytest.mark.full
 def test_noise_alone_widens_little(known: SampledFit) -> None:
     plain, widened = pulls(known, 0.0)
     assert np.mean(plain < 1.96) == pytest.approx(0.95, abs=0.04)
@@ -191,7 +192,9 @@ def test_intervals_of_a_decay_with_an_amplitude_of_its_own_cover_under_misfit() 
     assert np.median(plain / widened) / 1.96 < 1.8
 
 
-def test_a_failed_check_widens_the_parameters_of_a_decay_with_dry_friction() -> None:
+def test_a_failed_check_widens_the_parameters_of_a_decay_with_dry_friction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As for a run, by differences: the derivatives of a decay with dry friction take as long to compile."""
+    monkeypatch.setattr(verdict, "linearised", lambda *at: (plain_residuals(*at), plain_jacobian(*at)))
     assert record_widenings(replace(dry_decay(), findings=())) == {}
     assert all(one.factor < 1.01 for one in record_widenings(dry_decay()).values())
     # The stiffness falls by 5 % with the amplitude.

@@ -108,6 +108,7 @@ def test_the_likeliest_candidates_about_a_wrong_bench_lead_to_the_maximum() -> N
     np.testing.assert_allclose(weigh(target, ends), np.max(fit.log_posterior), atol=0.1)
 
 
+@pytest.mark.full
 def test_where_motions_have_kinks_candidates_descend_before_they_are_chosen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,6 +93,7 @@ def replicates() -> list[LeastSquaresFit]:
     return [solve(Partial(_decay_residual, jnp.asarray(y)), np.ones((1, 2))) for y in clean + noise]
 
 
+@pytest.mark.full
 def test_standard_errors_match_the_scatter(replicates: list[LeastSquaresFit]) -> None:
     error = np.array([fit.x[0] - DECAY_TRUTH for fit in replicates])
     pull = error / np.array([errors_of(fit, residual_sd=DECAY_SD) for fit in replicates])
@@ -104,6 +105,7 @@ def test_standard_errors_match_the_scatter(replicates: list[LeastSquaresFit]) ->
     assert np.abs((error / conditional).std(axis=0, ddof=1) - 1).min() > 0.106
 
 
+@pytest.mark.full
 def test_residual_variance_is_unbiased(replicates: list[LeastSquaresFit]) -> None:
     ratio = np.mean([residual_sd_of(fit) ** 2 for fit in replicates]) / DECAY_SD**2
     # χ² with 18 degrees of freedom over 400 experiments: sd √(2 / 18 / 400).

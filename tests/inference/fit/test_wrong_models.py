@@ -52,6 +52,7 @@ def _no_other_laws(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(point_stage, "compare_laws", lambda *_: [])
 
 
+@pytest.mark.full
 def test_the_papers_model_leaves_white_residuals() -> None:
     assert whiteness_of().level == "ok"
 

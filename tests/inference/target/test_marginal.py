@@ -146,7 +146,7 @@ def coarse() -> tuple[LogPosterior, dict[str, float]]:
     return LogPosterior(rig, make_experiments(rig)), known
 
 
-@pytest.fixture(scope="module", params=["twin", "coarse"])
+@pytest.fixture(scope="module", params=["twin", pytest.param("coarse", marks=pytest.mark.full)])
 def marginal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> MarginalPosterior:
     target, known = coarse() if request.param == "coarse" else twin(tmp_path_factory.mktemp("rig") / "rig", 4)
     return MarginalPosterior(target, approximate(target, known))
