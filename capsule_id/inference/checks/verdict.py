@@ -305,7 +305,7 @@ def model_errors(s: SampledFit) -> dict[str, Widening]:
     found: dict[str, Widening] = {}
     for facts in (f.facts for f in s.findings if f.level == "warn" and f.code in ("decays.hidden", "decays.held")):
         limits = facts["low"], facts["high"]
-        before = found[facts["name"]].limits if facts["name"] in found else limits
+        before = (found[facts["name"]].limits if facts["name"] in found else None) or limits
         found[facts["name"]] = Widening(1.0, 1.0, 0, (min(limits[0], before[0]), max(limits[1], before[1])))
     return {**found, **beside_stated(s, {**widenings(s), **record_widenings(s)})}
 
