@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lsim
 
 from capsule_id.experiments.base import Fitted, ValuesBySymbol, refit, stretch
-from capsule_id.experiments.free_vibration.decrement import STRONGEST, UNKNOWNS, viscous_fit, viscous_state
+from capsule_id.experiments.free_vibration.decrement import PEAKLESS, STRONGEST, UNKNOWNS, viscous_fit, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FURTHER,
@@ -330,6 +330,8 @@ def check_held(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
     for k, name in enumerate(("k1", "c")):
         value = fit.values[name]
         errors = np.array([own[name][1] for own in alone])
+        if not np.all((errors > 0.0) & np.isfinite(errors)):
+            continue  # a record that does not determine it, or whose errors are lost in rounding
         error = float(np.sum(errors**-2.0) ** -0.5)
         for e, others, weight in zip(judged, allowed, (error / errors) ** 2, strict=True):
             # The other records keep what they tell.
@@ -350,12 +352,15 @@ def check_held(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
 
 def _releases(e: DecayRecord, theta: ValuesBySymbol) -> np.ndarray:
     """k1, c and their standard errors, (r, 4), SI, of viscous decays that the record allows with r later releases."""
-    known, ones = (e.whitened(theta, part) for part in (np.column_stack(e.unwhitened(theta, np)), np.ones((e.n, 1))))
-    squares = float(np.sum(without(known[:, 1:], known[:, 0])[0] ** 2))
     time, m1, period = e.time - e.time[0], e.mass, 2.0 * np.pi * float(np.sqrt(theta["m1"] / theta["k1"]))
-    variance = squares / max(len(time) - UNKNOWNS, 1)
     later = int(np.searchsorted(time, LATEST_RELEASE * period))
-    if len(time) < later + 2 * UNKNOWNS or not squares > 0.0:
+    if len(time) < later + 2 * UNKNOWNS:
+        return np.zeros((0, 4))
+    free = viscous_fit(time[later:], e.values[later:], rough=PEAKLESS)
+    known, ones = (e.whitened(theta, part) for part in (np.column_stack(e.unwhitened(theta, np)), np.ones((e.n, 1))))
+    sd = float(np.sqrt(np.sum(without(known[:, 1:], known[:, 0])[0] ** 2) / max(e.n - UNKNOWNS, 1)))
+    # Of a light decay a quarter of a period tells little.
+    if free.ratio < PEAKLESS or not 0.0 < sd < np.inf:
         return np.zeros((0, 4))
 
     def values(z: np.ndarray) -> dict[str, float]:
@@ -363,24 +368,23 @@ def _releases(e: DecayRecord, theta: ValuesBySymbol) -> np.ndarray:
         return {"k1": m1 * omega**2, "c": 2.0 * ratio * omega * m1, "m1": m1}
 
     def left(z: np.ndarray, release: float) -> np.ndarray:
-        """Residuals of a rod that is held until ``release``, (n,)."""
+        """Residuals of a rod that is held until ``release``, (n,), in units of the noise."""
         own, held = values(z), time < release
         x, rate = viscous_state(np.where(held, 0.0, time - release), own, np.array([1.0, 0.0]), 0)
         motion = (x, rate, -(own["c"] * rate + own["k1"] * x) / m1)[e.order]
         moved = np.column_stack([np.where(held, float(e.order == 0), motion), e.values])
         moved, observed = np.asarray(e.whitened(theta, moved)).T
-        return without(np.column_stack([moved, ones]), observed)[0]
+        return without(np.column_stack([moved, ones]), observed)[0] / sd
 
-    free = viscous_fit(time[later:], e.values[later:])
-    z, tried = np.log([free.omega, max(free.ratio, ROUNDING)]), []
+    z, tried = np.log([free.omega, free.ratio]), []
     bounds = z - WIDEST, z + WIDEST
     for release in np.linspace(LATEST_RELEASE * period, 0.0, RELEASES + 1):
         found = least_squares(left, z, args=(release,), bounds=bounds, x_scale=0.1, max_nfev=30)
         z, k1, c = found.x, *(values(found.x)[name] for name in ("k1", "c"))
-        inverse = variance * np.linalg.pinv(found.jac.T @ found.jac)
+        inverse = np.linalg.pinv(found.jac.T @ found.jac)
         errors = [2.0 * k1 * np.sqrt(inverse[0, 0]), c * np.sqrt(np.sum(inverse))]
         tried.append((2.0 * float(found.cost), k1, c, *errors))
     table = np.array(tried)
     # A second fit has more forces, which take up a hold.
-    excess = variance * (EVIDENCE if e.replaced else QUANTILE_975**2)
-    return table[table[:, 0] - min(squares, np.min(table[:, 0])) < excess, 1:]
+    excess = EVIDENCE if e.replaced else QUANTILE_975**2
+    return table[table[:, 0] - min(max(e.n - UNKNOWNS, 1), np.min(table[:, 0])) < excess, 1:]
