@@ -147,6 +147,8 @@ class Experiment(eqx.Module):
     time_series: ClassVar[bool] = False
     #: Whether the forward model is the event-driven capsule: forward-mode derivatives only, and slow (milliseconds).
     event_driven: ClassVar[bool] = False
+    #: Whether derivatives of the residuals take seconds to compile, and the residuals do not.
+    slow_to_differentiate: ClassVar[bool] = False
     #: Whether an estimate from these readings alone may be negative, as the slope of a falling line is.
     estimates_may_be_negative: ClassVar[bool] = False
     #: Whether the noise model holds a slow drift, so that slow residuals are no misfit.

@@ -412,6 +412,10 @@ class DecayRecord(Decay):
         return not self.model.symbols
 
     @property
+    def slow_to_differentiate(self) -> bool:
+        return not self.closed
+
+    @property
     def own_symbols(self) -> tuple[str, ...]:
         return () if self.closed else ("amplitude", "turning_time")
 
