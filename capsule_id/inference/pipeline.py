@@ -46,7 +46,7 @@ from capsule_id.views import Comparison, Finding
 #: Number of posterior draws for bands and predictive p-values, and of prior draws in the saved sample.
 BAND_DRAWS, PRIOR_DRAWS = 200, 2000
 #: Walkers, and draws of each, at which densities of left-out readings are stored; the largest number of stored replicates.
-POINTWISE, REPLICATES = 24, 1_000_000
+POINTWISE, REPLICATES = 32, 1_000_000
 #: Steps of the stored densities (natural logarithm) and replicates (in sd of a reading): a file packs rounded numbers to
 #: a third. The step of a replicate adds 0.002 % to its variance.
 DENSITY_STEP, REPLICATE_STEP = 2.0**-16, 2.0**-6
