@@ -145,9 +145,7 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     findings = list(checked.findings)
     for lost in (False, True):
         factors = [
-            (name, one.factor, one.parts)
-            for name, one in widened.items()
-            if one.no_number == lost and (lost or one.parts)
+            (name, one.factor, one.parts) for name, one in widened.items() if one.parts and one.no_number == lost
         ]
         if factors:
             names = tuple(name for name, *_ in factors) if lost else ()

@@ -76,8 +76,8 @@ class Widening:
     ----------
     factor : of its sd, at least 1
     quantile : Student's t quantile over the normal one, for the ends of the 95 % interval
-    parts : number of parts of the data; 0: none, the readings allow forces that move the value between ``limits``
-    limits : of the 95 % interval, SI, in the place of factor and quantile
+    parts : number of parts of the data; 0 where only ``limits`` widen the interval
+    limits : that the 95 % interval must hold too, SI
     """
 
     factor: float

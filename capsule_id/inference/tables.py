@@ -297,23 +297,18 @@ def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool
     if widening.no_number:
         return {"widening": widening.factor, **dict.fromkeys(("value", "sd", "lower", "upper"), np.nan)}
     factor, value, stretch = widening.factor, entry["value"], widening.stretch
-    if widening.limits is None:
-        own = {end: entry[end] for end in ("lower", "upper") if end in entry}
-        moved = {
-            end: value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
-            for end, limit in own.items()
-        }
-    else:
-        low, high = widening.limits
-        moved = {"lower": min(low, entry.get("lower", low)), "upper": max(high, entry.get("upper", high))}
-        factor = max((moved["upper"] - moved["lower"]) / (2.0 * QUANTILE_975 * entry["sd"]), 1.0)
-    before = {f"{key}_unwidened": entry[key] for key in ("sd", "lower", "upper") if key in entry}
-    return {
-        "widening": factor,
-        "sd": factor * entry["sd"],
-        **before,
-        **{end: moved[end] for end in moved if end in entry},
+    moved = {
+        end: value * (entry[end] / value) ** stretch if positive else value + stretch * (entry[end] - value)
+        for end in ("lower", "upper")
+        if end in entry
     }
+    if widening.limits is not None:
+        low, high = widening.limits
+        factor = max(factor, (high - low) / (2.0 * QUANTILE_975 * entry["sd"]))
+        if moved:
+            moved = {"lower": min(low, moved["lower"]), "upper": max(high, moved["upper"])}
+    before = {f"{key}_unwidened": entry[key] for key in ("sd", *moved)}
+    return {"widening": factor, "sd": factor * entry["sd"], **before, **moved}
 
 
 def _limited(entry: Mapping[str, Any]) -> dict[str, object]:

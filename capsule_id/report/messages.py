@@ -402,6 +402,8 @@ QUESTIONS: Mapping[str, str] = {
     "runs.predictable": "Does one initial state predict the whole run? Its error grows {growth:.2g} times, limit 1000.",
     "runs.repeated": "Does the misfit repeat with the excitation? {p:p}, limit 0.002 over all channels.",
     "decays.halves": "Do both halves of the record agree? {name}: {z:.2g} sd apart, limit 4 (a warning above 3).",
+    "decays.hidden": "Do the records exclude further forces?",
+    "decays.held": "Is the instant of the release known?",
     "decays.stiffness": "Is k1 the same at all amplitudes? {p:p}, limit 0.002.",
     "decays.position": "Do the residuals depend on the position? {p:p}, limit 0.002 over all records.",
     "decays.residuals": "Do the residuals grow with the amplitude? {p:p}, limit 0.002 over all records.",

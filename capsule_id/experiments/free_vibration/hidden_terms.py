@@ -324,10 +324,11 @@ def check_held(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
     judged = [e for e in records if e.table.label not in stated]
     if not judged:
         return []
-    alone = [refit(e, e.local(fit.values), []) for e in judged]
     allowed = [_releases(e, e.local(fit.values)) for e in judged]
+    matters = any(map(len, allowed))
+    alone = [refit(e, e.local(fit.values), []) for e in judged] if matters else []
     findings = list[Finding]()
-    for k, name in enumerate(("k1", "c")):
+    for k, name in enumerate(("k1", "c") if matters else ()):
         value = fit.values[name]
         errors = np.array([own[name][1] for own in alone])
         if not np.all((errors > 0.0) & np.isfinite(errors)):
@@ -357,10 +358,11 @@ def _releases(e: DecayRecord, theta: ValuesBySymbol) -> np.ndarray:
     if len(time) < later + 2 * UNKNOWNS:
         return np.zeros((0, 4))
     free = viscous_fit(time[later:], e.values[later:], rough=PEAKLESS)
+    if free.ratio < PEAKLESS:  # a quarter of a period tells little of a light decay
+        return np.zeros((0, 4))
     known, ones = (e.whitened(theta, part) for part in (np.column_stack(e.unwhitened(theta, np)), np.ones((e.n, 1))))
     sd = float(np.sqrt(np.sum(without(known[:, 1:], known[:, 0])[0] ** 2) / max(e.n - UNKNOWNS, 1)))
-    # Of a light decay a quarter of a period tells little.
-    if free.ratio < PEAKLESS or not 0.0 < sd < np.inf:
+    if not 0.0 < sd < np.inf:
         return np.zeros((0, 4))
 
     def values(z: np.ndarray) -> dict[str, float]:

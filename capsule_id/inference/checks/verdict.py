@@ -301,13 +301,13 @@ def beside_stated(s: SampledFit, found: Mapping[str, Widening]) -> dict[str, Wid
 
 
 def model_errors(s: SampledFit) -> dict[str, Widening]:
-    """Error of the model by name of the parameter: what the readings allow (forces, a hold), or from parts of the data."""
-    found: dict[str, Widening] = {}
+    """Error of the model by name of the parameter: from parts of the data, and what the readings allow (forces, a hold)."""
+    found = beside_stated(s, {**widenings(s), **record_widenings(s)})
     for facts in (f.facts for f in s.findings if f.level == "warn" and f.code in ("decays.hidden", "decays.held")):
-        limits = facts["low"], facts["high"]
-        before = (found[facts["name"]].limits if facts["name"] in found else None) or limits
-        found[facts["name"]] = Widening(1.0, 1.0, 0, (min(limits[0], before[0]), max(limits[1], before[1])))
-    return {**found, **beside_stated(s, {**widenings(s), **record_widenings(s)})}
+        one = found.get(facts["name"], Widening(1.0, 1.0, 0))
+        low, high = one.limits or (np.inf, -np.inf)
+        found[facts["name"]] = replace(one, limits=(min(low, facts["low"]), max(high, facts["high"])))
+    return found
 
 
 def has_own_nuisances(e: Experiment) -> bool:

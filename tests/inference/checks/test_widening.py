@@ -10,6 +10,7 @@ from scipy import stats
 
 import capsule_id as cid
 from capsule_id.api import Fit
+from capsule_id.inference import tables
 from capsule_id.inference.checks.verdict import beside_stated, widening
 from capsule_id.inference.point_stage import Widening
 from tests.experiments.bench import K1, M1, released
@@ -66,6 +67,29 @@ def test_trials_in_sessions_are_widened_and_not_trusted(tmp_path: Path) -> None:
     assert mu["lower"] < mu["lower_unwidened"] < mu["value"] < mu["upper_unwidened"] < mu["upper"]
     (found,) = [f for f in result.findings if f.code == "model.error"]
     assert "parts)" in result.text(found)
+
+
+@pytest.mark.parametrize(
+    ("one", "lower", "upper", "sd"),
+    [
+        (Widening(1.0, 1.0, 0, (5.0, 11.0)), 5.0, 12.0, 6.0 / 3.92),
+        (Widening(3.0, 1.0, 4, (5.0, 11.0)), 4.0, 16.0, 3.0),  # the parts say more than the limits
+        (Widening(3.0, 1.0, 4, (1.0, 20.0)), 1.0, 20.0, 19.0 / 3.92),
+        (Widening(3.0, 1.0, 4), 4.0, 16.0, 3.0),
+    ],
+)
+def test_an_interval_holds_what_parts_and_what_limits_say(one: Widening, lower: float, upper: float, sd: float) -> None:
+    """Before: a failed check of any record took the limits away, and the text still said that the interval holds them."""
+    entry = {"value": 10.0, "sd": 1.0, "lower": 8.0, "upper": 12.0}
+    found = tables._widened(entry, one, positive=False)
+    assert (found["lower"], found["upper"], found["sd"]) == pytest.approx((lower, upper, sd), rel=1e-3)
+    assert (found["lower_unwidened"], found["sd_unwidened"]) == (8.0, 1.0)
+    # Without a sample there is an sd alone.
+    alone = tables._widened({"value": 10.0, "sd": 1.0}, one, positive=False)
+    assert alone.keys() == {"widening", "sd", "sd_unwidened"}
+    assert alone["sd"] == pytest.approx(
+        max(3.0 if one.parts else 1.0, np.ptp(one.limits) / 3.92 if one.limits else 0.0), rel=1e-3
+    )
 
 
 def test_a_clean_fit_is_not_widened(tmp_path: Path) -> None:
