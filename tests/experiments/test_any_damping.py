@@ -212,6 +212,16 @@ def test_a_known_release_leaves_the_interval_as_it_is(tmp_path: Path) -> None:
         assert abs(result.summary.at["k1", "value"] - k1) < 3.0 * result.summary.at["k1", "sd"]
 
 
+def test_a_small_change_counts_where_a_decay_does_not_swing(tmp_path: Path) -> None:
+    """A clean decay of ratio 0.9, whose c further forces may change by less than 20 %: the interval holds that too."""
+    time, x, k1, c, m1 = twin(0.9, 4)
+    result = cid.fit(cid.read_rig(folder(tmp_path, time, x, m1)), budget=None)
+    found = {f.facts["name"]: f.facts for f in result.findings if f.code == "decays.hidden"}
+    assert found.keys() == {"k1", "c"}
+    assert 0.8 * c < found["c"]["low"] < c < found["c"]["high"] < 1.2 * c
+    assert found["k1"]["low"] < k1 < found["k1"]["high"]
+
+
 def asked(path: Path) -> str:
     """The line of ``[prior]`` for which a check of the rig folder asks, "" where it asks for none."""
     rig, kinds = cid.read_rig(path), default_registry()

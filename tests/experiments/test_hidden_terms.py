@@ -24,12 +24,14 @@ from capsule_id.experiments.free_vibration.record import Screened
 from capsule_id.experiments.free_vibration.second_fit import open_models, second_models
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.statistics import further_columns
+from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Finding
 from tests.cli_tools import DATA
 from tests.experiments import bench
+from tests.inference.stub import plain_jacobian, plain_residuals
 from tests.scipy_decay import scipy_decay
 
 RELEASE, NOISE = 2e-3, 4e-5
@@ -106,6 +108,22 @@ def test_with_the_remedy_c_is_trusted_and_covered(short: Fit) -> None:
     row = fit.summary.loc["c"]
     assert row["trust"] == "trusted"
     assert row["lower"] < DRY["c"] < row["upper"]
+
+
+def test_the_jacobian_of_decays_with_further_forces_is_that_by_numpy() -> None:
+    """Two records in one group, both with dry friction and a cubic spring; derivatives come from differences."""
+    words = {"damping": ("viscous", "dry"), "stiffness": "cubic"}
+    table = decay_table(SHORT, DRY, **words)
+    rig = bench.rig(table, replace(decay_table(SHORT, DRY, seed=2, **words), label="second"))
+    target = LogPosterior(rig, make_experiments(rig))
+    assert [len(group.members) for group in target.groups] == [2]
+    starts = target.starts()
+    u = target.unconstrain(np.array([starts[name].centre for name in target.names])) + 1e-3 * target.positive
+    residuals, jacobian = linearised(target, u)
+    expected = plain_jacobian(target, u)
+    np.testing.assert_allclose(residuals, plain_residuals(target, u), rtol=1e-9, atol=1e-9)
+    size = np.max(np.abs(expected), axis=0)
+    np.testing.assert_allclose(jacobian / size, expected / size, rtol=0.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
