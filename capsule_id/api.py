@@ -352,8 +352,7 @@ def compare(a: Result, b: Result) -> pd.DataFrame:
     Returns
     -------
     DataFrame with a row per common parameter (index ``name``), SI: unit, value and sd of both, ``difference`` (b - a),
-    its ``sd``, ``sds`` (their ratio) and ``differs``: |sds| beyond the normal quantile that two equal rigs exceed in
-    any parameter in 1 of 20 cases.
+    its ``sd``, ``sds`` (their ratio) and ``differs``: more sds than two equal rigs differ by in any parameter in 1 of 20 cases.
 
     Raises
     ------

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import capsule_id as cid
@@ -16,6 +17,7 @@ from capsule_id.experiments.kind import default_registry
 from capsule_id.parameters import Parameter
 from capsule_id.report import html as citation
 from capsule_id.report.columns import COLUMNS
+from capsule_id.report.messages import QUESTIONS, messages_of
 from capsule_id.rig.model import ModelChoices
 from capsule_id.rig.schema import OPTIONAL
 from capsule_id.views import Trust
@@ -23,7 +25,9 @@ from tests.cli_tools import ROOT, parsers
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 GUIDE_FOLDER = ROOT / "capsule_id" / "guide"
-GUIDE = {path.stem: path.read_text(encoding="utf-8") for path in sorted(GUIDE_FOLDER.glob("*.md"))}
+INDEX = GUIDE_FOLDER / "index.md"  # of the site: a list of the pages
+PAGES = sorted(path for path in GUIDE_FOLDER.glob("*.md") if path != INDEX)
+GUIDE = {path.stem: path.read_text(encoding="utf-8") for path in PAGES}
 TEXTS = {ROOT / "README.md": README} | {GUIDE_FOLDER / f"{name}.md": text for name, text in GUIDE.items()}
 EVERYTHING = "\n".join(TEXTS.values())
 KINDS = default_registry()
@@ -147,7 +151,7 @@ def test_every_link_leads_to_a_file_and_readme_links_every_page() -> None:
         assert links, path
         assert [link for link in links if not (path.parent / link).is_file()] == [], path
     linked = {ROOT / link for link in re.findall(r"\]\(([^)#:]+)\)", README)}
-    assert linked == {path for path in GUIDE_FOLDER.iterdir() if path.is_file()}
+    assert linked == {path for path in GUIDE_FOLDER.iterdir() if path.is_file()} - {GUIDE_FOLDER / "conf.py", INDEX}
 
 
 def test_the_figure_is_small_and_described() -> None:
@@ -216,6 +220,51 @@ def test_every_path_that_the_texts_name_exists() -> None:
     named = set(re.findall(r"`((?:capsule_id|data|notebooks|tests)/[\w/.]*)`", EVERYTHING))
     assert len(named) >= 25
     assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_the_checks_are_those_of_the_package() -> None:
+    """Every question in its words, and every other code that can be a finding, with its title and its levels."""
+    messages = messages_of(KINDS)
+    asked = rows("| check | question | limit |", GUIDE["checks"])
+    assert {code: cells[0] for code, cells in asked.items()} == {
+        code: text.partition("?")[0] + "?" for code, text in QUESTIONS.items()
+    }
+    for code, text in QUESTIONS.items():
+        stated = re.findall(r"0\.\d+|\d+ sd|\d{3,}", re.sub(r"\{[^}]*\}", "", text))
+        assert all(number in asked[code][1] for number in stated), code
+    others = {
+        code: [words.title, ", ".join(level for level in ("fail", "warn", "ok") if getattr(words, level))]
+        for code, words in messages.items()
+        if code not in QUESTIONS and (words.ok or words.warn or words.fail)
+    }
+    assert rows("| finding | subject | levels |", GUIDE["checks"]) == others
+
+
+def test_the_list_of_public_names_is_whole() -> None:
+    assert sorted(re.findall(r"^   ([A-Za-z_]+)$", GUIDE["api"], re.MULTILINE)) == cid.__all__
+
+
+#: Columns of the files that the how-tos name without ``columns``.
+OF_DATA = {"run.csv": "run_1.csv", "motor.csv": "motor_current.csv", "decay.csv": "free_vibration_1.csv"}
+
+
+@pytest.mark.parametrize("block", blocks("toml", GUIDE["how_to"]), ids=lambda block: block.splitlines()[-1][:20])
+def test_the_lines_of_the_how_tos_are_read(block: str, tmp_path: Path) -> None:
+    """Each block with the file that it names, beside the masses; lines without an experiment act on a decay."""
+    content = tomllib.loads(block)
+    first = "" if "experiment" in content else '[[experiment]]\nkind = "free_vibration"\nfile = "decay.csv"\n'
+    rig = '[rig]\nname = "x"\nm1 = { value = 110, sd = 0.5, unit = "g" }\nm2 = { value = 530, unit = "g" }\n'
+    text = rig + (block + first if "model" in content else first + block)
+    (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+    for entry in tomllib.loads(text)["experiment"]:
+        table = pd.read_csv(ROOT / "data" / OF_DATA[entry["file"]])
+        if "P_d" in entry:
+            table = table.drop(columns="current [A]")
+        if "columns" in entry:
+            table.columns = [column["from"] for column in entry["columns"].values()]
+        table.to_csv(tmp_path / entry["file"], index=False)
+    rig_read = cid.read_rig(tmp_path)
+    assert [table.kind for table in rig_read.tables] == [each["kind"] for each in tomllib.loads(text)["experiment"]]
 
 
 def test_the_exit_codes_are_those_of_the_command() -> None:

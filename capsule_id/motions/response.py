@@ -302,7 +302,7 @@ class Response:
     label : "P-<period>-<direction>-<contacts>"; "aperiodic"; "not settled" where a motion without a period has a negative
         Lyapunov exponent: it approaches a period, and more periods must be dropped; "failed" where the run was given up
     period : in excitation periods, 1..16; 0 for the other labels
-    direction : "F" forward, "B" backward, "S" standing (|advance| < 1e-7 m per excitation period), "" where failed
+    direction : "F" forward, "B" backward, "S" standing (it advances less than 1e-7 m in an excitation period), "" where failed
     contacts_per_period : closings of the gap per excitation period
     mean_velocity : of the capsule over the observed periods, m/s
     status : a ``Status`` code

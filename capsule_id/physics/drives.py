@@ -52,7 +52,7 @@ class Pulses(Drive):
 
     @property
     def amplitude(self) -> Any:
-        """The larger of |P_on| and |P_off|, N."""
+        """The larger magnitude of P_on and P_off, N."""
         return array_module(self.P_on).maximum(abs(self.P_on), abs(self.P_off))
 
     def force_at(self, t: Any, piece: Any = None) -> Any:

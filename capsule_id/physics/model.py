@@ -164,7 +164,7 @@ class Excitation(Drive):
 
     @property
     def amplitude(self) -> Any:
-        """|P_d|, N."""
+        """Magnitude of P_d, N."""
         return abs(self.P_d)
 
     def cosine(self, t: Any) -> Any:
@@ -178,11 +178,11 @@ class Excitation(Drive):
         return self.P_d * self.cosine(t)
 
     def frequency(self) -> Any:
-        """|Omega|."""
+        """Magnitude of Omega, rad/s."""
         return jnp.abs(self.Omega)
 
     def rate(self, piece: Piece, t: jax.Array) -> Any:
-        """|Omega|."""
+        """Magnitude of Omega, rad/s."""
         del piece, t
         return jnp.abs(self.Omega)
 
