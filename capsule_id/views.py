@@ -140,7 +140,7 @@ class Points:
     y: np.ndarray
     y_error: np.ndarray | None = None
     flagged: np.ndarray | None = None
-    role: Literal["static", "dynamic", "sliding", "data"] = "data"
+    role: Literal["static", "dynamic", "mean", "sliding", "data"] = "data"
 
 
 @dataclass(frozen=True)

@@ -241,10 +241,18 @@ def friction_panels(
     if "v_s" in paper:
         curves.append(Curve("the paper's fit", speed, unit_law(**paper).forward(speed), role="paper"))
     if any(e.role == "dynamic" for e in experiments) and not any(e.ground for e in experiments):
-        reading = np.maximum(speed[1:], 1e-3 * speed[-1])
-        distance = slide_distance(friction.coefficient(theta), 1.0 / theta["g"], reading)
-        expected = reading**2 / (2.0 * theta["g"] * distance)
-        curves.append(Curve("this fit, read as v²/(2gd)", reading, expected, role="alternative"))
+        # v²/(2gd) is a mean over all speeds of a slide. Over this fit's mean, times its coefficient at the speed of the
+        # push, it is the coefficient that the reading means there.
+        def mean_of_slides(law: FrictionModel, speeds: np.ndarray) -> np.ndarray:
+            return speeds**2 / (2.0 * theta["g"] * slide_distance(law.coefficient(theta), 1.0 / theta["g"], speeds))
+
+        slow = np.maximum(speed[1:], 1e-3 * speed[-1])
+        curves.append(Curve("this fit, read as v²/(2gd)", slow, mean_of_slides(friction, slow), role="alternative"))
+        for at, (e, read) in enumerate(zip(experiments, tuple(points), strict=True)):
+            if e.role == "dynamic":
+                known = e.friction.coefficient(theta).forward(read.x) / mean_of_slides(e.friction, read.x)
+                points[at] = replace(read, y=read.y * np.asarray(known))
+                points.append(replace(read, label=f"{e.label}, read as v²/(2gd)", role="mean"))
     panel = Comparison(
         "friction",
         "friction",

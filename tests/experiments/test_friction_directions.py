@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 import capsule_id as cid
 from capsule_id.errors import InputError
+from capsule_id.experiments.friction import friction_panels
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.physics.forces import CoulombStribeck
 from tests.measured.folders import Entry, make_rig, named_line, quantity
@@ -93,3 +95,19 @@ def test_ten_thousand_tilts_take_seconds(tmp_path: Path) -> None:
     row = cid.fit(rig, budget=None).summary.loc["mu"]
     assert time.process_time() - begin < 20.0
     assert np.rad2deg(np.arctan(row["map"])) == pytest.approx(33.0, abs=0.02)
+
+
+def test_the_picture_shows_pushes_on_the_law_and_as_the_paper_reads_them(tmp_path: Path) -> None:
+    """Slides without scatter, by SciPy: their points stand on the law, and as v²/(2gd) above it, on a curve of its own."""
+    speed, law = np.array([0.2, 0.5, 1.0]), CoulombStribeck(0.66, 1.0, 0.3)
+    distance = [quad(lambda u: u / (9.81 * float(law.forward(u))), 0.0, v)[0] for v in speed]
+    columns = {"speed [m/s]": speed, "distance [mm]": 1e3 * np.array(distance)}
+    made = make_experiments(make_rig(tmp_path, Entry("dynamic_friction", "push", columns, {}), head=MASSES))
+    (panel,) = friction_panels(made, {"mu": 0.66, "v_s": 0.3, "g": 9.81, "push_scatter": 0.05}, [])  # pyright: ignore[reportArgumentType]
+    points, curves = ({one.label: one for one in group} for group in (panel.points, panel.curves))
+    np.testing.assert_allclose(points["push"].y, law.forward(speed), rtol=1e-4)
+    mean = points["push, read as v²/(2gd)"].y
+    np.testing.assert_allclose(mean, speed**2 / (2.0 * 9.81 * np.array(distance)), rtol=1e-6)
+    drawn = curves["this fit, read as v²/(2gd)"]
+    np.testing.assert_allclose(np.interp(speed, drawn.x, drawn.y), mean, rtol=1e-3)
+    assert np.all(mean > 1.05 * points["push"].y)

@@ -33,8 +33,15 @@ from capsule_id.physics.model import (
 )
 from capsule_id.records.motion import fit_mean_velocity, measured_motion
 from capsule_id.records.tones import relative_position, stated_gap, stated_Omega, tone_at
-from capsule_id.records.view import FILTER_ORDER, RunRecord, view_record
-from capsule_id.rig.filters import choose_window, median_step, sampling_step, savitzky_golay, window_samples
+from capsule_id.records.view import FILTER_ORDER, PASS_BAND_MULTIPLE, SMALLEST_RATE_GAIN, RunRecord, view_record
+from capsule_id.rig.filters import (
+    dominant_frequency,
+    longest_window,
+    median_step,
+    sampling_step,
+    savitzky_golay,
+    window_samples,
+)
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTable
 
@@ -297,26 +304,28 @@ SHOWN = {"x_rel": "x_rel", "x_capsule": "capsule", "acceleration_rod": "rod's ac
 
 
 def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
-    """Phase portrait, rate of x_rel by Savitzky–Golay against x_rel; [] for a record sampled unevenly."""
+    """Phase portrait: the record and the fitted motion through one filter; [] for a record sampled unevenly.
+
+    The filter passes the oscillation of the closed contact at the fit, so that contacts show.
+    """
     index, column = run.names.index("x_rel"), run.table.columns["x_rel"]
-    values, unit = column.values, column.to_display
-    motion = run.motion(theta, np)
+    unit, p = column.to_display, run.capsule(theta)[0]
     offset = run.scaled(theta, np)[index].at_nuisance_mean(np)[1][0] * run.channels[index].width
-    x, y = np.asarray(motion.x_rel) + offset, np.asarray(motion.Y1 - motion.Y2)
+    sides = column.values, np.asarray(run.motion(theta, np).x_rel) + offset
     try:
-        window = choose_window(run.time, values, FILTER_ORDER)
-        recorded, fitted = (_filtered(run.time, side, window) for side in (values, x))
+        step, fastest = sampling_step(run.time), PASS_BAND_MULTIPLE * dominant_frequency(run.time, sides[1])
+        if run.spring is not None and "m1" in theta:
+            fastest = max(fastest, float(np.sqrt((p.k1 + p.k2) / p.m1)) / (2.0 * np.pi))  # pyright: ignore[reportArgumentType]
+        window = longest_window(fastest * step, len(run.time), FILTER_ORDER, SMALLEST_RATE_GAIN, derivative=1)
+        recorded, fitted = (_filtered(run.time, side, window * step) for side in sides)
     except InputError:
         return []
-    curves = [
-        Curve("this fit", x * unit, y),
-        Curve("this fit through the same filter", fitted[0] * unit, fitted[1], role="alternative"),
-    ]
+    curves = [Curve("this fit", fitted[0] * unit, fitted[1])]
     if run.spring is not None:
-        gap = (float(run.capsule(theta)[0].G) + offset) * unit  # pyright: ignore[reportArgumentType]
-        ends = np.array([y.min(), y.max()])
+        gap = (float(p.G) + offset) * unit  # pyright: ignore[reportArgumentType]
+        ends = np.array([fitted[1].min(), fitted[1].max()])
         curves.append(Curve("support spring", np.array([gap, gap]), ends, role="paper"))
-    label, points = f"{run.label}_phase_portrait", Points("record, Savitzky–Golay", recorded[0] * unit, recorded[1])
+    label, points = f"{run.label}_phase_portrait", Points("record", recorded[0] * unit, recorded[1])
     axes = axis_label(column), "rate of x_rel, m/s"
     return [Comparison("phase_portrait", label, f"{run.label}: phase portrait", *axes, (points,), tuple(curves))]
 

@@ -49,7 +49,8 @@ _MANY = 100
 
 _POINT_STYLES: dict[str, dict[str, Any]] = {
     "static": {"marker": "o", "mfc": "none", "color": BLACK},
-    "dynamic": {"marker": "x", "color": VERMILION},
+    "dynamic": {"marker": "s", "mfc": "none", "color": BLUE},
+    "mean": {"marker": "x", "color": PURPLE, "alpha": 0.6},
     "sliding": {"marker": "^", "mfc": "none", "color": GREEN},
     "data": {"marker": "o", "mfc": "none", "color": BLACK},
 }
