@@ -174,11 +174,13 @@ def test_missing_parts_are_refused_not_drawn_empty(result: Result) -> None:
     assert len(figures.comparison_figure(_named(result, "free_vibration_1")).axes) == 3
 
 
-def forced_run(period: int = 150, n: int = 1800, decay: float = 0.0, bad: int = 700) -> Comparison:
+def forced_run(
+    period: int = 150, n: int = 1800, decay: float = 0.0, bad: int = 700, trend: float = 0.3
+) -> Comparison:
     """A record whose third harmonic is the largest one; its largest residuals are in the samples from ``bad`` on."""
     rng, t = np.random.default_rng(0), np.arange(n) / 1000.0
     phase = 2.0 * np.pi * np.arange(n) / period
-    fitted = np.exp(-decay * t) * (np.sin(phase) + 2.0 * np.sin(3.0 * phase)) + 0.3 * t
+    fitted = np.exp(-decay * t) * (np.sin(phase) + 2.0 * np.sin(3.0 * phase)) + trend * t
     residuals = rng.normal(size=n)
     residuals[bad : bad + 200] *= 3.0
     return Comparison(
@@ -208,6 +210,21 @@ def test_a_record_of_many_periods_shows_three_of_them_in_full(period: int) -> No
     assert len(figures.comparison_figure(item).axes) == 4
     assert "the periods with the largest residuals" in comparison_caption(item, {})
     assert "periods" not in comparison_caption(dataclasses.replace(item, curves=()), {})
+
+
+def test_a_decay_is_drawn_until_it_dies_away_and_its_residuals_whole(result: Result) -> None:
+    """Half of the panel was noise. A decay that still moves at its end, and a run, are drawn to their ends."""
+    dying, moving = forced_run(decay=12.0, trend=0.0), forced_run(decay=1.0, trend=0.0)
+    end, whole = figures.end_of_motion(dying), dying.points[0].x
+    assert end is not None
+    assert np.max(np.abs(dying.curves[0].y[whole > end])) < 0.1 * np.ptp(dying.curves[0].y)
+    assert 0.2 * whole[-1] < end < 0.75 * whole[-1]
+    top, below, _ = figures.comparison_figure(dying).axes
+    assert top.get_xlim()[1] == end
+    assert "dies away" in top.get_title(loc="left")
+    assert below.get_xlim()[1] >= whole[-1]
+    for item in (moving, forced_run(period=150), _named(result, "motor_current")):
+        assert figures.end_of_motion(item) is None
 
 
 def test_a_decay_and_a_short_record_are_drawn_whole(result: Result) -> None:

@@ -126,17 +126,20 @@ def comparison_figure(item: Comparison) -> Figure:
     """
     below = [residuals] * (item.residuals is not None) + [autocorrelation] * (item.autocorrelation is not None)
     figure = new_figure(9.0 if item.autocorrelation is not None else 6.4, 5.6)
-    period = period_of(item)
+    period, end = period_of(item), None
     look: dict[str, Any] = {"height_ratios": (1.7, 1.0), "width_ratios": (1.0, 1.4) if period else None}
     grid = figure.add_gridspec(2, max(len(below), 1), hspace=0.38, wspace=0.25, **look)
     top = figure.add_subplot(grid[0, 0] if period else grid[0, :] if below else grid[:, :])
     if period:
         ranges(item, period, top)
         comparison(worst_periods(item, period), figure.add_subplot(grid[0, 1]))
+    elif (end := end_of_motion(item)) is not None:
+        comparison(replace(item, title=f"{item.title}, until it dies away in the noise"), top)
+        top.set_xlim(right=end)
     else:
         comparison(item, top)
     for column, panel in enumerate(below):
-        panel(item, figure.add_subplot(grid[1, column], sharex=top if panel is residuals else None))
+        panel(item, figure.add_subplot(grid[1, column], sharex=top if panel is residuals and end is None else None))
     return figure
 
 
@@ -196,6 +199,17 @@ def ranges(item: Comparison, period: int, ax: Axes) -> None:
         ax.plot(x, edge, label=label, **_CURVE_STYLES[curve.role])
     set_text(ax, item.x_label, item.y_label, item.title)
     set_legend(ax, "upper right")
+
+
+def end_of_motion(item: Comparison) -> float | None:
+    """First coordinate at which the fitted motion of a record has died away in its noise; None where that is near the end."""
+    curve, points = item.curves[0] if item.curves else None, item.points[0]
+    if item.autocorrelation is None or curve is None or not _MANY < points.x.size == curve.y.size:
+        return None
+    noise = 1.4826 * float(np.median(np.abs(points.y - curve.y)))
+    moves = np.flatnonzero(np.abs(curve.y - curve.y[-1]) > noise)
+    last = points.x[min(int(1.2 * moves[-1]), points.x.size - 1)] if moves.size else points.x[-1]
+    return float(last) if last - points.x[0] < 0.75 * np.ptp(points.x) else None
 
 
 def side_by_side(items: Sequence[Comparison]) -> Figure:
