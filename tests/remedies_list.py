@@ -391,7 +391,7 @@ FAULTS: list[Planted] = [
     *planted("four spikes", decay, partial(changed, partial(spikes, 4)), "a", 41, 42, 43),
     *planted("one spike", decay, partial(changed, partial(spikes, 1)), "a", 44),
     *planted("drop-outs", decay, partial(changed, zeros), "a", 45),
-    *planted("hum", decay, partial(changed, hum), "c", 46, 47, cause="50 Hz|hum"),
+    *planted("hum", decay, partial(changed, hum), "a", 46, 47),
     *planted("further modes", decay, partial(changed, modes), "c", 48, 49, cause="oscillation|mode"),
     *planted("coarse steps", partial(decay, samples=2000, step=2e-3), partial(changed, coarse), "a", 50, 63),
     *planted("clipped", decay, partial(changed, clipped), "a", 52),

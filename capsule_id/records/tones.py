@@ -111,6 +111,9 @@ OMEGA_RELATIVE_DIFFERENCE = 1e-3
 #: faults, two had such a line, both clipped and undamped; of 200 with hum or further modes of 5 to 20 %, 183 had one. The
 #: bounds were chosen on these records.
 LEAST_POWER, PROMINENT = 1e-3, 100.0
+#: Smallest ratio of the amplitudes of hum in the halves of a record: other modes die away. Multiples of a decay's frequency
+#: at which its residuals hold errors of its model, and part of it by which other residuals of its own motion are off.
+LASTING, MULTIPLES, NEAR = 0.7, 5, 0.15
 _SEARCH_HALF_WIDTH = 1.5  # about a first guess, in 1 / duration: a spectral peak is 1 wide
 _SEARCH_POINTS = 25
 #: Relative tolerance of the sum of squares and of the frequency.
@@ -198,6 +201,28 @@ def other_tone(time: Record, values: Record) -> float | None:
         if power[i] > PROMINENT * min(around):
             return float(f[i])
     return None
+
+
+def lasting_tone(time: Record, values: Record, own: float) -> float:
+    """Frequency, Hz, of a line in the residuals of a decay that does not die away with it, as hum does; 0 without one.
+
+    Parameters
+    ----------
+    time, values : (n,) s, evenly spaced, and any unit
+    own : frequency of the decay, Hz, near whose first multiples the errors of its model lie
+    """
+    n, step = len(time), float(time[-1] - time[0]) / (len(time) - 1)
+    power = np.abs(np.fft.rfft((values - np.mean(values)) * np.hanning(n), 4 * n)) ** 2
+    f, width = np.fft.rfftfreq(4 * n, step), 2.0 / (n * step)
+    multiple = np.clip(np.round(f / own), 1.0, MULTIPLES)
+    apart = np.where((f > width) & (np.abs(f - multiple * own) > width), power, 0.0)
+    best = int(np.argmax(apart))
+    if not apart[best] > PROMINENT * np.median(power):
+        return 0.0
+    Omega = _refine(time, values, 2.0 * np.pi * float(f[best]))[0]
+    found = Omega / (2.0 * np.pi)
+    first, second = (tone_at(time[part], values[part], Omega)[0] for part in (slice(n // 2), slice(n // 2, None)))
+    return found if abs(found - own) > NEAR * own and LASTING * first < second < first / LASTING else 0.0
 
 
 def tone_at(time: Record, values: Record, Omega: float) -> tuple[float, float, float]:

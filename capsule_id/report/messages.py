@@ -496,7 +496,7 @@ def _decay_remedy(facts: Facts) -> str:
     """What the fitted model of a free decay contains, and what is left to do."""
     present = f"Present in the fitted model: {', '.join(facts['present'])}. " if facts["present"] else ""
     if facts.get("tone"):
-        return present + filled_in(TONE, facts)
+        return present + filled_in(TONE, facts) + " Remove its source, and record again, or state it as hum."
     cut = "Cut the record to free decay with start and stop"
     if (start := facts.get("start")) is not None:
         cut = f'Leave out the larger half of the amplitudes: write start = {{ value = {start:.10g}, unit = "s" }} in its entry'

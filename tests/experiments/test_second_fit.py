@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 import capsule_id as cid
 from capsule_id import cli
+from capsule_id.experiments.base import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import MESSAGES, lint_decay
 from capsule_id.experiments.free_vibration.models import decay
@@ -19,9 +21,11 @@ from capsule_id.experiments.free_vibration.second_fit import (
     Ranking,
     Screening,
     demands_another,
+    hum_of,
     second_models,
     simplest,
 )
+from capsule_id.experiments.statistics import ljung_box
 from tests.experiments import bench
 from tests.measured.folders import Entry, make_rig, quantity
 
@@ -221,3 +225,59 @@ def test_the_console_says_that_the_model_is_another(
         fitted = cid.load(tmp_path / f"{name}_out")
         for text in (str(fitted), fitted._repr_html_()):
             assert ("contradicts the first model" in text.replace("\n", " ")) == (name == "dry")
+
+
+def humming(frequency: float = 50.0, size: float = 20.0, dying: float = 0.0, **settings: Any) -> FreeVibration:
+    """A viscous decay with a tone of ``size`` sds of its noise, which dies away at the rate ``dying``, 1/s."""
+    tone = size * np.exp(-dying * TIME) * np.sin(2.0 * np.pi * frequency * TIME + 0.7)
+    return record(tone, **settings)
+
+
+@pytest.mark.parametrize("frequency", [50.0, 60.02, 141.3])
+def test_hum_is_modelled_and_its_frequency_found(frequency: float) -> None:
+    (found,), (finding,) = second_models([humming(frequency)])
+    assert found.model == DecayModel(hum=found.model.hum)
+    assert found.model.hum == pytest.approx(frequency, abs=0.01)
+    assert f"hum of {frequency:.4g} Hz" in found.model.name
+    assert finding.facts["lines"].endswith(f'hum = {{ value = {found.model.hum:.6g}, unit = "Hz" }}')
+    noise = dict(zip(found.scatters, [NOISE], strict=True))
+    # Least squares of SciPy with the tone as it was made.
+    theta = {"m1": bench.M1, "k1": bench.K1, "c": C, **noise}
+    values = {name: value for name, (value, _) in refit(found, theta, []).items()}
+    fit = least_squares(
+        lambda z: _left_by_scipy(found, *z, frequency), [bench.K1, C], x_scale=[1.0, 1e-3], xtol=1e-12, ftol=1e-12
+    )
+    assert values["k1"] == pytest.approx(fit.x[0], rel=2e-5)
+    assert values["c"] == pytest.approx(fit.x[1], rel=2e-3)
+
+
+def _left_by_scipy(e: FreeVibration, k1: float, c: float, frequency: float) -> np.ndarray:
+    """Readings less the best motion, offset and tone, in units of the noise."""
+    gamma, turn = c / (2.0 * bench.M1), 2.0 * np.pi * frequency * TIME
+    omega = np.sqrt(k1 / bench.M1 - gamma**2)
+    swing = np.exp(-gamma * TIME)[:, None] * np.column_stack([np.cos(omega * TIME), np.sin(omega * TIME)])
+    tone = np.column_stack([np.cos(turn), np.sin(turn)])
+    design = np.column_stack([swing, np.ones_like(TIME), tone, TIME[:, None] * tone])
+    return (e.values - design @ np.linalg.lstsq(design, e.values)[0]) / NOISE
+
+
+def test_no_hum_is_found_where_there_is_none() -> None:
+    """Noise, a second mode that dies away, dry friction, a cubic spring: hum would be the wrong word for each."""
+    assert hum_of(record(0.0)) == 0.0
+    assert hum_of(humming(141.3, size=60.0, dying=9.0)) == 0.0
+    assert hum_of(record(0.0, DRY)) == 0.0
+    assert hum_of(record(0.0, {"k_cubic": 0.3 * SPRING_FORCE / RELEASE**3})) == 0.0
+    assert hum_of(humming(size=0.3)) == 0.0
+
+
+def test_hum_and_a_further_force_are_found_together_and_stated_hum_is_kept() -> None:
+    tone = 20.0 * np.sin(2.0 * np.pi * 50.0 * TIME)
+    (found,), _ = second_models([record(tone, DRY)])
+    assert found.model.symbols == ("F_dry",)
+    assert found.model.hum == pytest.approx(50.0, abs=0.05)
+    values = found.about.screened.values
+    assert values["F_dry"] == pytest.approx(DRY["F_dry"], rel=0.02)
+    assert ljung_box(np.asarray(found.residuals({**values, found.scatters[0]: NOISE}, np))[: found.n])[1] > 0.01
+    stated = humming(hum=50.0)
+    assert stated.model.hum == 50.0
+    assert second_models([stated]) == ([stated], [])

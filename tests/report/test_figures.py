@@ -174,9 +174,7 @@ def test_missing_parts_are_refused_not_drawn_empty(result: Result) -> None:
     assert len(figures.comparison_figure(_named(result, "free_vibration_1")).axes) == 3
 
 
-def forced_run(
-    period: int = 150, n: int = 1800, decay: float = 0.0, bad: int = 700, trend: float = 0.3
-) -> Comparison:
+def forced_run(period: int = 150, n: int = 1800, decay: float = 0.0, bad: int = 700, trend: float = 0.3) -> Comparison:
     """A record whose third harmonic is the largest one; its largest residuals are in the samples from ``bad`` on."""
     rng, t = np.random.default_rng(0), np.arange(n) / 1000.0
     phase = 2.0 * np.pi * np.arange(n) / period

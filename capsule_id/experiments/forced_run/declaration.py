@@ -519,7 +519,7 @@ KIND = Kind(
     informs="all of them together, and the gap",
     captions={
         "forced_run": "Forced run: one recorded channel, its residuals at the point fit, and their autocorrelation.",
-        "phase_portrait": "Phase plane as the paper draws it: record and model through the same Savitzky–Golay filter, the impact line.",
+        "phase_portrait": "Phase plane as in the paper: record and model through one Savitzky–Golay filter; impact line.",
     },
     messages=MESSAGES,
     bench=False,

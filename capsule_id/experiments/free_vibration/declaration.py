@@ -125,12 +125,12 @@ def _faults(entry: Entry[DecaySettings]) -> Iterator[tuple[Any, ...]]:
             (
                 points and getattr(settings, key) not in (None, default),
                 key,
-                "turning points have white noise and no drift, and each of them counts",
+                "turning points have white noise, no drift and no hum, and each of them counts",
                 str(getattr(settings, key)),
                 f"remove {key}, or samples",
                 True,
             )
-            for key, default in (("drift", "none"), ("noise", "white"), ("thin", 1))
+            for key, default in (("drift", "none"), ("noise", "white"), ("thin", 1), ("hum", None))
         ),
     )
     thin = settings.thin or 1
@@ -295,6 +295,8 @@ TEMPLATE = """\
 #: "white" (default), "ar1" (correlated, one correlation time) or "arma" (correlated and white). The last two include
 #: stated reading errors
 # noise = "white"
+#: frequency of hum of constant amplitude beside the decay, integrated out; default: found in the record
+# hum = { value = 50, unit = "Hz" }
 #: fit means of so many consecutive samples; default: 1 for records of up to 2000 samples, longer ones keep about 32
 #: means per period
 # thin = 1

@@ -362,7 +362,7 @@ class FreeVibration(DecayRecord):
         return nested_starts(self)
 
     def noise_facts(self) -> Facts:
-        present, tone = self.model.additions, other_tone(self.time, self.values)
+        present, tone = self.model.additions, None if self.model.hum else other_tone(self.time, self.values)
         facts = {
             "model": "decay",
             "present": present,

@@ -104,7 +104,10 @@ def _named(table: Table[Any], release: Sequence[Finding], faults: Sequence[Findi
     channel, used = next(name for name in table.columns if name != "time"), window_of(table)
     tone = other_tone(table["time"][used], table[channel][used]) if blamed else None
     if tone is not None:
-        yield Finding("decays.tone", "fail", {"file": table.file, "column": channel, "tone": tone}, table.label)
+        open_words = None in table.settings.choices
+        if table.settings.hum is None:
+            facts = {"file": table.file, "column": channel, "tone": tone}
+            yield Finding("decays.tone", "warn" if open_words else "fail", facts, table.label)
         return
     feigned = any(found.code in ("readings.spike", "readings.dropouts", "readings.clipped") for found in faults)
     yield from (*(() if feigned else release), *faults)
@@ -291,11 +294,17 @@ def _alias(texts: tuple[str, str], facts: Facts) -> str:
 #: Remedy of an oscillation that no key describes; a later start or stop does not remove it.
 TONE = (
     "An oscillation of {tone:.4g} Hz lies beside that of the rod, as hum of the mains (50 or 60 Hz) or another mode of the "
-    "structure does. Remove its source, and record again."
+    "structure does."
 )
 
 LINT_MESSAGES = {
-    "decays.tone": Message("further oscillations", fail="{file}: {column} must show one decaying oscillation. " + TONE),
+    "decays.tone": Message(
+        "further oscillations",
+        warn="{file}: {column} must show one decaying oscillation. "
+        + TONE
+        + " The fit takes it for hum where its amplitude is constant. It is better to remove its source.",
+        fail="{file}: {column} must show one decaying oscillation. " + TONE + " Remove its source, or state it as hum.",
+    ),
     "decays.release": Message(
         "release of a decay",
         warn=(

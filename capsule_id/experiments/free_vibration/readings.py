@@ -216,6 +216,13 @@ def block_mean(values: Any, weights: Any, xp: Any) -> Any:
     return xp.einsum("nq,nq...->n...", weights, xp.reshape(values, shape))
 
 
+def hum_columns(time: Any, hum: float, xp: Any) -> Any:
+    """(n, 4) cosine and sine of this frequency, Hz, at the times (n,), s, and both times a slope: size and phase may drift."""
+    angle = 2.0 * np.pi * hum * time
+    tone = xp.stack([xp.cos(angle), xp.sin(angle)], axis=1)
+    return xp.concatenate([tone, (time / time[-1] - 0.5)[:, None] * tone], axis=1)
+
+
 # settings: Settings of a free vibration, the model that they state, and the window that contains the free decay.
 
 
@@ -273,6 +280,7 @@ class DecaySettings(GroundSettings):
     stiffness: Literal["linear", "cubic"] | None = None
     drift: Literal["none", "linear", "gp"] | None = None
     noise: Literal["white", "ar1", "arma"] | None = None
+    hum: Annotated[float | None, QuantityRule("Hz")] = None
     thin: Annotated[int | None, COUNT] = None
     samples: Literal["record", "turning_points"] = "record"
     smoothing_window: Annotated[float | None, QuantityRule("s")] = None
@@ -301,6 +309,7 @@ class DecayModel:
     cubic : whether the spring has a cubic term
     drift, noise : as in ``DecaySettings``
     thin : the likelihood uses means of so many consecutive samples
+    hum : frequency of a tone of constant amplitude beside the decay, Hz; 0 without one
     """
 
     damping: tuple[str, ...] = ()
@@ -308,6 +317,7 @@ class DecayModel:
     drift: str = "none"
     noise: str = "white"
     thin: int = 1
+    hum: float = 0.0
 
     @classmethod
     def stated(cls, settings: DecaySettings) -> "DecayModel":
@@ -319,6 +329,7 @@ class DecayModel:
             settings.drift or "none",
             settings.noise or "white",
             settings.thin or 1,
+            settings.hum or 0.0,
         )
 
     def lines(self, *keys: str) -> str:
@@ -330,8 +341,9 @@ class DecayModel:
             "drift": f'"{self.drift}"',
             "noise": f'"{self.noise}"',
             "thin": str(self.thin),
+            "hum": f'{{ value = {self.hum:.6g}, unit = "Hz" }}',
         }
-        return ", ".join(f"{key} = {values[key]}" for key in keys)
+        return ", ".join(f"{key} = {values[key]}" for key in (*keys, *(["hum"] if self.hum else [])))
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -372,7 +384,11 @@ class DecayModel:
     @property
     def additions(self) -> list[str]:
         """Effects of the model that the default lacks, in words."""
-        return [*(EFFECTS[symbol] for symbol in self.symbols), *["drift of the zero"] * (self.drift != "none")]
+        return [
+            *(EFFECTS[symbol] for symbol in self.symbols),
+            *["drift of the zero"] * (self.drift != "none"),
+            *["hum"] * bool(self.hum),
+        ]
 
     @property
     def name(self) -> str:
@@ -382,6 +398,7 @@ class DecayModel:
             "cubic spring" if self.cubic else "",
             _DRIFTS.get(self.drift, ""),
             _NOISES.get(self.noise, ""),
+            f"hum of {self.hum:.4g} Hz" if self.hum else "",
             f"means of {self.thin} samples" if self.thin > 1 else "",
         )
         return ", ".join(filter(None, words))

@@ -62,6 +62,7 @@ from capsule_id.experiments.free_vibration.readings import (
     channel_of,
     decay_window,
     further_parameters,
+    hum_columns,
     is_even,
     stated_model,
 )
@@ -447,6 +448,9 @@ class DecayRecord(Decay):
         trend = xp.ones((self.n, 1))
         if self.model.drift == "linear":
             trend = xp.stack([xp.ones(self.n), xp.asarray(self.time) / self.time[-1] - 0.5], axis=1)
+        if self.model.hum:
+            tone = hum_columns(xp.asarray(self.nodes).ravel(), self.model.hum, xp)
+            trend = xp.concatenate([trend, block_mean(tone, self.weights, xp)], axis=1)
         nodes = xp.asarray(self.nodes).ravel() * stretch(self.clock_rate, theta)
         if self.closed:
             basis = viscous_basis(nodes, theta["k1"], theta["c"], theta["m1"], xp)
@@ -491,9 +495,16 @@ class DecayRecord(Decay):
 
     @property
     def condensed(self) -> tuple[np.ndarray, np.ndarray]:
-        """As ``whole``; of a long record block means, for the paper's estimate. Their times start at the first mean."""
+        """As ``whole``; of a long record block means, for the paper's estimate. Their times start at the first mean.
+
+        Hum of the model is taken off beside a viscous decay: it would be taken for swings.
+        """
         time, values = shortened(*decay_window(self.table))
-        return time - time[0], values
+        time, tone = time - time[0], np.zeros_like(values)
+        for _ in range(2 if self.model.hum else 0):
+            columns = hum_columns(time, self.model.hum, np)
+            tone = columns @ np.linalg.lstsq(columns, viscous_fit(time, values - tone).left + tone)[0]
+        return time, values - tone
 
     def smoothed(self) -> np.ndarray:
         """The condensed record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""

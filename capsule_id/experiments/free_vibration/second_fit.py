@@ -32,6 +32,8 @@ from capsule_id.experiments.free_vibration.readings import (
     block_mean,
     block_means,
     first_periods,
+    hum_columns,
+    is_even,
     natural_units,
 )
 from capsule_id.experiments.free_vibration.record import DecayRecord, ReadingTimes, Screened, whiten_by_shape
@@ -39,7 +41,7 @@ from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.experiments.statistics import further_columns, ljung_box, weighted_mean
 from capsule_id.physics.batches import pool
 from capsule_id.physics.exact.engine import as_one_function
-from capsule_id.records.tones import noise_level
+from capsule_id.records.tones import NEAR, lasting_tone, noise_level
 from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding
 
@@ -182,23 +184,31 @@ def _readings(paths: HalfCycles, nodes: Any, weights: Any, order: int) -> Any:
 
 
 @as_one_function
-def _whitened(times: ReadingTimes, raw: Any, thetas: Mapping[str, Any], sloped: Any) -> Any:
-    """(batch, n) whitened residuals at the best offset and, where ``sloped`` is 1, the best slope."""
-    time = times.time
-    slope = sloped * (time - jnp.mean(time)) / (time[-1] - time[0])
+def _whitened(times: ReadingTimes, raw: Any, thetas: Mapping[str, Any], design: Any) -> Any:
+    """(batch, n) whitened residuals beside the best sum of the columns of ``design`` (n, q), which may be 0."""
     # A drift counts in units of the noise, which is white where the ratio is beyond its bounds.
     drift = thetas["drift_ratio"] * jnp.where(thetas["white_ratio"] > np.exp(BOUNDS["white_ratio"][1]), WHITE, 1.0)
 
     def one(raw: Any, shape: Mapping[str, Any]) -> Any:
-        white = whiten_by_shape(times, jnp.stack([raw, jnp.ones_like(raw), slope], axis=1), "arma", shape)
-        own, design = white[:, 0], white[:, 1:]
-        normal, moment = design.T @ design, design.T @ own
-        a, b, d = normal[0, 0], normal[0, 1], normal[1, 1] + 1e-9
-        offset = jnp.stack([d * moment[0] - b * moment[1], a * moment[1] - b * moment[0]]) / (a * d - b**2)
-        return own - design @ offset
+        white = whiten_by_shape(times, jnp.concatenate([raw[:, None], design], axis=1), "arma", shape)
+        for j in range(design.shape[1]):  # Gram and Schmidt: LAPACK cannot be called from here
+            column = white[:, j + 1]
+            white = white - jnp.outer(column, column @ white / (column @ column + 1e-9))
+        return white[:, 0]
 
     shapes = {name: thetas[name] for name in ("noise_time", "white_ratio", "drift_time")}
     return jax.vmap(one)(raw, {**shapes, "drift_ratio": drift})
+
+
+def hum_of(record: DecayRecord) -> float:
+    """Frequency of the hum of a record, Hz: stated, or that of a lasting tone beside its viscous fit; 0 without one."""
+    time, values = record.whole
+    if record.model.hum or not is_even(time):
+        return record.model.hum
+    fit, peaks = viscous_fit(time, values), record.rough.Omega_o / (2.0 * np.pi)
+    tone = lasting_tone(time, fit.left, fit.omega / (2.0 * np.pi))
+    # Where the fit misses the motion, as behind lost samples, its residuals hold that motion.
+    return tone if abs(tone - peaks) > NEAR * peaks else 0.0
 
 
 class Screening:
@@ -214,6 +224,15 @@ class Screening:
         self.blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
         self.values, self.times = self.blocks.values, ReadingTimes.of(self.blocks)
         self.number = most_half_cycles(float(record.time[-1]), self.omega)
+        time, hum = self.times.time, record.model.hum
+        linear = np.column_stack([np.ones(len(time)), (time - np.mean(time)) / np.ptp(time)])
+        tone = (
+            block_mean(hum_columns(self.blocks.nodes.ravel(), hum, np), self.blocks.weights, np)
+            if hum
+            else linear[:, :0]
+        )
+        #: (n, q) offset, drift, and hum.
+        self.design = np.column_stack([linear, tone])
         k1 = k1 or record.rough.k1
         self.units = natural_units(k1, record.mass, abs(peak)) | {
             "k1": k1,
@@ -295,11 +314,12 @@ class Screening:
         start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
         jacobians: dict[bytes, np.ndarray] = {}
         unit = float(np.std(self.values))
+        design = self.design * np.where(np.arange(self.design.shape[1]) == 1, model.drift == "linear", 1.0)
 
         def whitened(whole: np.ndarray) -> np.ndarray:
             """(names + 1, n) residuals at as many scaled unknowns."""
             thetas, motion = self.motions(whole)
-            return np.asarray(_whitened(self.times, self.values - motion, thetas, model.drift == "linear")[0]) / unit
+            return np.asarray(_whitened(self.times, self.values - motion, thetas, design)[0]) / unit
 
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
@@ -368,7 +388,7 @@ class Screening:
     ) -> Screened:
         """Estimates at the end ``found`` of a fit, at the scaled unknowns ``z`` (names,); ``unit`` of its residuals."""
         free = free_symbols(model)
-        n, unknowns = len(self.values), len(free) + 2 + int(model.drift == "linear")
+        n, unknowns = len(self.values), len(free) + self.design.shape[1] + int(model.drift == "linear")
         deviance = n * (np.log(2.0 * found.cost * unit**2 / n) + 1.0 + LOG_2PI)
         values = {name: float(value) for name, value in self.theta(z).items()}
         norms = np.linalg.norm(found.jac, axis=0)
@@ -639,13 +659,25 @@ def _demanded(records: list[DecayRecord], level: float) -> Demanded:
     contradicting = [e.label for e in records if e.n >= SHORTEST and demands_another(e, level)]
     if not contradicting:
         return (), records, {}
+    records = [e.with_model(replace(e.model, hum=hum_of(e))) if e.n >= SHORTEST else e for e in records]
     own = [e.with_model(e.model, table=first_periods(e.table)) for e in records]
-    ranking = demanded_model(own)
+    humming = [e for e in own if e.model.hum]
+    # Where hum is the cause, no further force is needed.
+    if humming and not any(demands_another(e, level) for e in own if e.n >= SHORTEST):
+        ranking = rank([*map(Screening, own)], [humming[0].model])[0]
+    else:
+        ranking = demanded_model(own)
     text = _drift_text(own, ranking)
     if ranking.model.slow and any(part.n < whole.n for part, whole in zip(own, records, strict=True)):
         text += f" The second fit uses the first {MOST_PERIODS} periods of each record."
     kept = own if ranking.model.slow else records
-    others = [e.with_model(ranking.model, fit) for e, (fit, _) in zip(kept, ranking.fits, strict=True)]
+    others = [
+        e.with_model(replace(ranking.model, hum=e.model.hum), fit)
+        for e, (fit, _) in zip(kept, ranking.fits, strict=True)
+    ]
+    if humming and len(others) > 1:
+        tones = ", ".join(f"{e.model.hum:.6g} Hz in {e.label}" for e in humming)
+        text += f" Each record has its own hum: {tones}."
     return contradicting, others, {"drift": text}
 
 
