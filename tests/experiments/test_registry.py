@@ -65,6 +65,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "stiffness": (ChoiceRule(("linear", "cubic")), None),
         "drift": (ChoiceRule(("none", "linear", "gp")), None),
         "noise": (ChoiceRule(("white", "ar1", "arma")), None),
+        "hum": (QuantityRule("Hz"), None),
         "thin": (COUNT, None),
         "samples": (ChoiceRule(("record", "turning_points")), "record"),
         "smoothing_window": (QuantityRule("s"), None),

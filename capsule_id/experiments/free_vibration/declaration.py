@@ -125,7 +125,7 @@ def _faults(entry: Entry[DecaySettings]) -> Iterator[tuple[Any, ...]]:
             (
                 points and getattr(settings, key) not in (None, default),
                 key,
-                "turning points have white noise, no drift and no hum, and each of them counts",
+                "turning points have white noise and no drift or hum, and each of them counts",
                 str(getattr(settings, key)),
                 f"remove {key}, or samples",
                 True,

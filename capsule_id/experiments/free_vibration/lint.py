@@ -302,7 +302,7 @@ LINT_MESSAGES = {
         "further oscillations",
         warn="{file}: {column} must show one decaying oscillation. "
         + TONE
-        + " The fit takes it for hum where its amplitude is constant. It is better to remove its source.",
+        + " The fit takes it for hum where its amplitude is constant. Otherwise remove its source, and record again.",
         fail="{file}: {column} must show one decaying oscillation. " + TONE + " Remove its source, or state it as hum.",
     ),
     "decays.release": Message(
