@@ -35,6 +35,7 @@ from capsule_id.inference.prediction import DRAWS, predict, random_draws
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
+from capsule_id.inference.tuning import Tuning, tune
 from capsule_id.output import check_directory, publish, replace_file, work_in_progress
 from capsule_id.parameters import by_index, is_stated, symbol_of
 from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
@@ -279,6 +280,15 @@ class Fit(Result):
     def prediction_figure(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Figure:
         """Figure of the predictions of ``predict``: mean velocity against period, with the trials of the fit."""
         return figures.side_by_side(predict(self, settings, draws, seed).panels)
+
+    def tune(
+        self, bounds: Mapping[str, tuple[float, float]], given: Mapping[str, float] | None = None, **options: Any
+    ) -> Tuning:
+        """Search the settings of drive and rig that maximise the mean velocity; see ``capsule_id.inference.tuning.tune``.
+
+        ``result.tune({"P_d": (1.0, 6.0), "Omega": (20.0, 50.0)}, {"G": 1e-3}).table``; bounds and given values in SI.
+        """
+        return tune(self, bounds, given, **options)
 
     def plot_comparison(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Readings with the predicted curve and its 95 % band; ``label`` as in ``comparisons``, by default the first."""
