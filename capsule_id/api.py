@@ -464,6 +464,7 @@ def fit(
     ess: float = DEFAULT_ESS,
     preliminary: Callable[[Fit], None] | None = None,
     contact: type[Force] | None = None,
+    profile: Sequence[str] = (),
 ) -> Fit:
     """Fit a rig: point estimate, posterior, checks. The command ``fit-params`` chooses every one of the parameters.
 
@@ -481,12 +482,13 @@ def fit(
         parameters are fitted instead of mu and v_s, or of k2
     ess : sampling stops at this bulk and tail effective sample size of every parameter
     preliminary : called before the sampling with the point fit: a result without intervals, panels, notes and records
+    profile : names of parameters whose profile likelihoods are computed: ``result.table("parameters.profile")``
 
     Raises
     ------
     InputError
         If ``rig`` cannot be read or holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or
-        ``ess`` is out of range, or ``friction`` or ``contact`` cannot be fitted.
+        ``ess`` is out of range, ``friction`` or ``contact`` cannot be fitted, or a parameter to ``profile`` is not sampled.
     """
     prepare_xla()
     rig = rig if isinstance(rig, Rig) else read_rig(rig, registry, friction, contact)
@@ -503,13 +505,16 @@ def fit(
         readings = check_readings(rig, experiments, kinds)
         made, second = second_models(make_experiments(rig, experiments, kinds, friction, contact), readings)
         target = LogPosterior(rig, made)
+        if unknown := [name for name in profile if name not in target.names]:
+            known = ", ".join(target.names)
+            raise InputError("a profile needs a parameter of the fit", unknown[0], f"choose from {known}")
         point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
         before = (*readings, *second)
         if preliminary is not None and budget is not None:
             first = unfinished(point, before)
             preliminary(make_result(first, kinds, seeds.report, made_from, Fit, panels=False))
         checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, show, ess), before)
-        return make_result(checked, kinds, seeds.report, made_from, Fit)
+        return make_result(checked, kinds, seeds.report, made_from, Fit, profiled=profile)
 
 
 def load(directory: str | Path, registry: Registry | None = None) -> Fit:
