@@ -20,7 +20,7 @@ from capsule_id.parameters import is_stated
 from capsule_id.views import ResultTable
 
 #: Values on either side of the best one, and their reach in posterior standard deviations.
-VALUES, REACH = 8, 3.0
+VALUES, REACH = 8, 4.0
 #: A profile that falls by this much has reached the end of its 95 % interval.
 DROP = 0.5 * float(stats.chi2.ppf(0.95, 1))
 #: A parameter with a smaller ratio of posterior to prior sd, and a smaller sd of its logarithm, is bounded without a profile.
@@ -126,4 +126,5 @@ def identified(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
             "with": target.names[partner],
             "sd / prior sd": ratio[i],
         }
-    return [ResultTable("parameters.identified", pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter"))]
+    frame = pd.DataFrame.from_dict(rows, orient="index").round(4).rename_axis("parameter")
+    return [ResultTable("parameters.identified", frame)]
