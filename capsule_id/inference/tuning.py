@@ -240,7 +240,7 @@ def _leaves(
         raise InputError("spring must be a fitted one", spring, f"choose from {', '.join(springs) or 'none'}")
     own = {*CAPSULE_LEAVES, *DRIVES[drive]}
     values: dict[str, Any] = {name: LEAVES[name].default for name in DRIVES[drive]}
-    values |= {"reaction": rig.model.share_of_reaction}
+    values |= {"reaction": rig.model.share_of_reaction, "slope": 0.0, "N0": 0.0}
     # Without a support spring the rod moves freely.
     values |= {"k2": 0.0, "G": np.inf} if not springs and not {"k2", "G"} & {*given, *searched} else {}
     stated = [(name, getattr(rig, name)) for name in ("m1", "m2", "g", "slope", "N0")]
@@ -268,11 +268,13 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
         settings = table.settings
         if not isinstance(settings, RunSettings | ProgressionSettings) or settings.drive != drive:
             continue
+        ground = {name: quantity.value for name, quantity in settings.ground.items()}
         if isinstance(settings, ProgressionSettings):
             rows, source = settings_of(table.columns, settings)
             speed = table["distance"] / (rows[:, 0] * rows[:, 1])
             for period, duty, size in np.unique(rows[:, (0, 2, 3)], axis=0):
                 own = {"period": period, "duty": duty} if drive == "pulses" else {"Omega": 2.0 * np.pi / period}
+                own |= ground
                 own |= {AMPLITUDE[drive]: size} if source == "column" else {}
                 own |= {AMPLITUDE[drive]: size * chosen["K"]} if source == "current" else {}
                 words = [f"{1e3 * period:g} ms", f"duty {duty:g}" if drive == "pulses" else ""]
@@ -287,7 +289,7 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
         force = chosen["K"] * current.amplitude if current and "K" in chosen else amplitude and amplitude.value
         if k2 is None or force is None:
             continue
-        own = {"k2": k2, "G": stated_gap(table).value, AMPLITUDE[drive]: force}
+        own = {"k2": k2, "G": stated_gap(table).value, AMPLITUDE[drive]: force, **ground}
         Omega = stated_Omega(table)
         own |= {"Omega": Omega} if drive == "harmonic" else {"period": 2.0 * np.pi / Omega, "duty": settings.duty}
         found.append((table.label, own, measured_motion(table).mean_velocity))

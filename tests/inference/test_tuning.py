@@ -1,5 +1,6 @@
 """The best setting of drive and rig: against an independent grid at the truth, its inputs, its operating points."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -85,6 +86,7 @@ def test_most_twins_are_driven_within_5_percent_of_their_best() -> None:
     assert np.sum(np.array(shares) >= 0.95) >= 18
 
 
+@pytest.mark.full
 def test_one_setting_seed_probability_and_what_stands_in_the_tables(quick: None) -> None:
     fit, given = fit_of(TRUTH, trust="not trusted"), {**GAP, "Omega": 34.56}
     one, again = (tune(fit, {"P_d": (3.0, 4.5)}, given, draws=4, seed=2) for _ in range(2))
@@ -150,9 +152,15 @@ def test_operating_points_of_runs(tmp_path: Path) -> None:
     np.testing.assert_allclose(settings["P_d"] / settings["P_d"][0], [1.0, 1.1])
     assert settings["k2"] is chosen["k2[medium]"]
     assert np.isfinite(speed)
+    sloping = [
+        replace(t, settings=replace(t.settings, slope=Quantity(0.02))) if t.label == label else t for t in rig.tables
+    ]
+    (_, settings, _), *_ = operating_points(fit_of(TRUTH, rig=replace(rig, tables=tuple(sloping))), chosen, "harmonic")
+    assert settings["slope"] == 0.02
     assert all(f"k2[{table.settings.spring}]" in chosen for table in rig.tables if table.label in [x[0] for x in found])
 
 
+@pytest.mark.full
 def test_a_robot_is_tuned_by_period_and_duty_beside_its_measured_settings(tmp_path: Path, quick: None) -> None:
     """Stated reaction and a fixed lag enter; the measured settings are predicted as they were measured."""
     periods = 1e-3 * np.array([40.0, 60.0, 80.0, 120.0])
