@@ -35,6 +35,7 @@ from capsule_id.inference.prediction import DRAWS, predict, random_draws
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
+from capsule_id.inference.tuning import Tuning, tune
 from capsule_id.output import check_directory, publish, replace_file, work_in_progress
 from capsule_id.parameters import by_index, is_stated, symbol_of
 from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
@@ -280,6 +281,15 @@ class Fit(Result):
         """Figure of the predictions of ``predict``: mean velocity against period, with the trials of the fit."""
         return figures.side_by_side(predict(self, settings, draws, seed).panels)
 
+    def tune(
+        self, bounds: Mapping[str, tuple[float, float]], given: Mapping[str, float] | None = None, **options: Any
+    ) -> Tuning:
+        """Search the settings of drive and rig that maximise the mean velocity; see ``capsule_id.inference.tuning.tune``.
+
+        ``result.tune({"P_d": (1.0, 6.0), "Omega": (20.0, 50.0)}, {"G": 1e-3}).table``; bounds and given values in SI.
+        """
+        return tune(self, bounds, given, **options)
+
     def plot_comparison(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Readings with the predicted curve and its 95 % band; ``label`` as in ``comparisons``, by default the first."""
         return _drawn(figures.comparison, _named(self.comparisons, label), ax)
@@ -453,6 +463,7 @@ def fit(
     ess: float = DEFAULT_ESS,
     preliminary: Callable[[Fit], None] | None = None,
     contact: type[Force] | None = None,
+    profile: Sequence[str] = (),
 ) -> Fit:
     """Fit a rig: point estimate, posterior, checks. The command ``fit-params`` chooses every one of the parameters.
 
@@ -470,12 +481,13 @@ def fit(
         parameters are fitted instead of mu and v_s, or of k2
     ess : sampling stops at this bulk and tail effective sample size of every parameter
     preliminary : called before the sampling with the point fit: a result without intervals, panels, notes and records
+    profile : names of parameters whose profile likelihoods are computed: ``result.table("parameters.profile")``
 
     Raises
     ------
     InputError
         If ``rig`` cannot be read or holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or
-        ``ess`` is out of range, or ``friction`` or ``contact`` cannot be fitted.
+        ``ess`` is out of range, ``friction`` or ``contact`` cannot be fitted, or a parameter to ``profile`` is not sampled.
     """
     prepare_xla()
     rig = rig if isinstance(rig, Rig) else read_rig(rig, registry, friction, contact)
@@ -492,13 +504,16 @@ def fit(
         readings = check_readings(rig, experiments, kinds)
         made, second = second_models(make_experiments(rig, experiments, kinds, friction, contact), readings)
         target = LogPosterior(rig, made)
+        if unknown := [name for name in profile if name not in target.names]:
+            known = ", ".join(target.names)
+            raise InputError("a profile needs a parameter of the fit", unknown[0], f"choose from {known}")
         point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
         before = (*readings, *second)
         if preliminary is not None and budget is not None:
             first = unfinished(point, before)
             preliminary(make_result(first, kinds, seeds.report, made_from, Fit, panels=False))
         checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, show, ess), before)
-        return make_result(checked, kinds, seeds.report, made_from, Fit)
+        return make_result(checked, kinds, seeds.report, made_from, Fit, profiled=profile)
 
 
 def load(directory: str | Path, registry: Registry | None = None) -> Fit:

@@ -62,7 +62,18 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
-    from capsule_id.commands import bifurcate, check, fit, import_file, init, predict, report, simulate, synthesize
+    from capsule_id.commands import (
+        bifurcate,
+        check,
+        fit,
+        import_file,
+        init,
+        predict,
+        report,
+        simulate,
+        synthesize,
+        tune,
+    )
 
     parser = _parser(program, "Make, check, fit, simulate and report.")
     parser.epilog = "example: %(prog)s check my-rig; each COMMAND has its own --help"
@@ -96,6 +107,12 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
             predict,
             "displacements of a capsule robot at new settings, from a result",
             "results/robot settings.csv --out predicted.csv",
+        ),
+        (
+            "tune",
+            tune,
+            "the settings of drive and rig with the largest mean velocity, from a result",
+            "results/twin --P_d 1 6 --Omega 20 50 --G 0.001 --spring soft --out tuned.csv",
         ),
         (
             "report",

@@ -16,7 +16,6 @@ from capsule_id.commands import NO_CACHE, PATH
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.simulate import (
     DEFAULTS,
-    capsule_and_drive,
     capsule_options,
     capsule_values,
     fitted_values,
@@ -268,6 +267,7 @@ def _dataset(
     """The Dataset for the options."""
     from capsule_id.motions import sweep
     from capsule_id.motions.response import Settling
+    from capsule_id.physics.drives import capsule_and_drive
     from capsule_id.report.write import read_draws
 
     settling = Settling(

@@ -49,6 +49,7 @@ OPTIONS = {
             f"draw so many effectively independent samples of every parameter (default {DEFAULT_ESS})",
             {"type": int, "default": DEFAULT_ESS},
         ),
+        ("--profile", "NAMES", "draw profile likelihoods of these parameters, e.g. k1,v_s, in the report"),
         ("--json", "", "print parameters.json instead of the table"),
         (
             "--compare",
@@ -101,7 +102,7 @@ def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> 
     """Print the comparison of models; 0."""
     if len(rigs) > 1:
         raise InputError("--compare takes one rig", counted(len(rigs), "rig"), "name one folder")
-    unused = {"out": None, "scheduler": None, "json": False, "resume": False}
+    unused = {"out": None, "scheduler": None, "profile": None, "json": False, "resume": False}
     unused |= {"experiments": "all", "max_steps": DEFAULT_MAX_STEPS, "ess": DEFAULT_ESS}
     ignored = [f"--{name}" for name, default in unused.items() if getattr(args, name) != default]
     if ignored:

@@ -30,19 +30,7 @@ def run(args: argparse.Namespace) -> int:
         If RESULT is none, holds no sample or no progression, the settings break a rule, or a file exists.
     """
     check_seed(args.seed)
-    for option, file in (("--out", args.out), ("--figure", args.figure)):
-        if file is None:
-            continue
-        with refusing(f"{option} must be writable", "name another file", file):
-            taken, room = file.exists(), file.parent.is_dir()
-        if taken:
-            raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
-        if not room:
-            raise InputError(f"{option} must stand in a directory", "there is none", f"make {file.parent}", file)
-    if args.figure is not None and (
-        args.figure.suffix.lower() != ".png" or args.figure.resolve() == args.out.resolve()
-    ):
-        raise InputError("--figure must name a .png file of its own", args.figure.name, "write NAME.png", args.figure)
+    check_new_files(args)
     prepare_jax(not args.no_cache)
     from capsule_id.api import load
     from capsule_id.inference.prediction import predict
@@ -60,3 +48,26 @@ def run(args: argparse.Namespace) -> int:
             replace_file(file, content)
         say(f"wrote {file}: {counted(len(made.table), 'setting')}" if option == "--out" else f"wrote {file}")
     return 0
+
+
+def check_new_files(args: argparse.Namespace) -> None:
+    """Refuse ``--out`` and ``--figure`` that are no new files in a directory, and a figure that is no PNG of its own.
+
+    Raises
+    ------
+    InputError
+        At the first fault.
+    """
+    for option, file in (("--out", args.out), ("--figure", args.figure)):
+        if file is None:
+            continue
+        with refusing(f"{option} must be writable", "name another file", file):
+            taken, room = file.exists(), file.parent.is_dir()
+        if taken:
+            raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
+        if not room:
+            raise InputError(f"{option} must stand in a directory", "there is none", f"make {file.parent}", file)
+    if args.figure is not None and (
+        args.figure.suffix.lower() != ".png" or args.figure.resolve() == args.out.resolve()
+    ):
+        raise InputError("--figure must name a .png file of its own", args.figure.name, "write NAME.png", args.figure)

@@ -74,7 +74,8 @@ def make_fit(
     from capsule_id.api import fit
 
     words = options.seed, options.experiments, options.budget, store, progress, kinds
-    result = fit(rig, *words, ess=options.ess, preliminary=preliminary)
+    profile = [name.strip() for name in (options.profile or "").split(",") if name.strip()]
+    result = fit(rig, *words, ess=options.ess, preliminary=preliminary, profile=profile)
     made = result.provenance.made[0], options.command
     return replace(result, provenance=replace(result.provenance, made=made))
 

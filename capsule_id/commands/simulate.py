@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -18,8 +18,7 @@ from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, by_in
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
-    from capsule_id.physics.drives import Pulses
-    from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
+    from capsule_id.physics.model import Trajectory
 
 
 # options: Parameters of the capsule and its drive as options, and their values from a result.
@@ -98,16 +97,6 @@ def capsule_values(
             "give --result DIR and --G X, in m, or remove --spring",
         )
     return values
-
-
-def capsule_and_drive(values: Mapping[str, Any], drive: str) -> "tuple[CapsuleParameters, Excitation | Pulses]":
-    """The model's parameters and the drive of that name, from values by symbol, SI."""
-    from capsule_id.physics.drives import Pulses
-    from capsule_id.physics.model import CapsuleParameters, Excitation
-
-    p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES if name in values})
-    own = {name: values[name] for name in DRIVES[drive]}
-    return p, Excitation(**own) if drive == "harmonic" else Pulses(**own)
 
 
 def number(name: str, text: str) -> float:
@@ -245,6 +234,7 @@ def run(args: argparse.Namespace) -> int:
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
     prepare_jax(not args.no_cache)
+    from capsule_id.physics.drives import capsule_and_drive
     from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.physics.model import Status, status_message
     from capsule_id.physics.simulation import simulate

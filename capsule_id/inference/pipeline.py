@@ -168,6 +168,7 @@ def make_result(
     kind: type[AnyResult] = Result,
     *,
     panels: bool = True,
+    profiled: Sequence[str] = (),
 ) -> AnyResult:
     """Assemble the result: tables, panels, records, and the arrays that are saved with the sample.
 
@@ -177,6 +178,7 @@ def make_result(
     ----------
     kind : class of the result; the interface passes a subclass with a method that writes it
     panels : False leaves out panels, notes and records, which take most of the time
+    profiled : names of the parameters whose profile likelihoods are computed
     """
     stop_if_interrupted()
     target, posterior = checked.target, checked.posterior
@@ -197,7 +199,7 @@ def make_result(
         posterior=posterior,
         findings=findings,
         comparisons=_comparisons(checked, predictive, registry) if panels else (),
-        notes=tuple(make_notes(checked, predictive)) if panels else (),
+        notes=tuple(make_notes(checked, predictive, profiled)) if panels else (),
         records=tuple(view for view in views if view is not None),
         fixed={name: value for name, value in target.fixed.items() if name != "g"},
         observed={e.label: e.observed for e in target.experiments},

@@ -122,7 +122,7 @@ def _from_maxima(
     """The fit at the highest of the maxima u (s, d), which ``starts`` (s, d) led to; see ``_maxima``."""
     best = _highest(value)
     _, at_fit = linearised(target, u[best])
-    root = np.matmul(*_root_of_covariance(target, u[best], at_fit))
+    root = np.matmul(*root_of_covariance(target, u[best], at_fit))
     spread = np.sqrt(np.sum(root**2, axis=1))
     return described(
         target,
@@ -152,21 +152,21 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     before, after = in_batches(density, starts), in_batches(density, ends)
     ends = np.where((after >= before)[:, None], ends, starts)
     best = int(np.argmax(np.nan_to_num(np.fmax(before, after), nan=-np.inf)))
-    roots = _root_of_covariance(target, ends[best], linearised(target, ends[best])[1])
+    roots = root_of_covariance(target, ends[best], linearised(target, ends[best])[1])
     # Every batch runs in the pool of threads, so the starts need their own.
     with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
         # SciPy hides this warning itself, but its way is not safe in threads.
         warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
-        highest = _polish(target, ends[best], roots)
+        highest = polish(target, ends[best], roots)
         if not highest[2]:
             # The best end of least squares may lie far from the maximum, where the curvature is another one.
-            roots = _root_of_covariance(target, highest[0], linearised(target, highest[0])[1])
-            highest = _polish(target, highest[0], roots)
+            roots = root_of_covariance(target, highest[0], linearised(target, highest[0])[1])
+            highest = polish(target, highest[0], roots)
         # An end of least squares within a fraction of a standard deviation leads to the same maximum.
         spread = np.sqrt(np.sum(np.matmul(*roots) ** 2, axis=1))
         away = np.any(np.abs(ends - highest[0])[:, located] > SAME_BASIN * spread[located], axis=1)
         away[best] = False
-        others = list(threads.map(lambda end: _polish(target, end, roots), ends[away]))
+        others = list(threads.map(lambda end: polish(target, end, roots), ends[away]))
     polished = [others.pop(0) if own else highest for own in away]
     u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     return u, value, converged
@@ -185,15 +185,17 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
     return centre + spread * z
 
 
-def _polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> tuple[Vector, float, bool]:
+def polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> tuple[Vector, float, bool]:
     """BFGS from ``end`` (d,) in coordinates whitened by ``roots``: maximum (d,), log-posterior there, converged.
+
+    Roots (d, k) search k directions only, k < d.
 
     The differences of its gradient are along the white coordinates; of more than ``MANY`` parameters along those of the first
     root alone, where all scatters share one difference.
     """
-    d, terms = len(end), terms_of(target)
-    (whitening, rotation), alone = roots, np.flatnonzero(target.integrated)
-    if d <= MANY:
+    (whitening, rotation), alone, terms = roots, np.flatnonzero(target.integrated), terms_of(target)
+    d = whitening.shape[1]
+    if d <= MANY or d < len(end):
         whitening, rotation, alone = whitening @ rotation, np.eye(d), alone[:0]
     rest, steps = np.setdiff1d(np.arange(d), alone), GRADIENT_STEP * directions(d, alone)
 
@@ -218,7 +220,7 @@ def _polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> 
     return end + whitening @ rotation @ solution.x, value, inside and bool(np.max(np.abs(solution.jac)) < MAXIMUM)
 
 
-def _root_of_covariance(target: LogPosterior, u: Vector, jacobian: Jacobian) -> tuple[Matrix, Matrix]:
+def root_of_covariance(target: LogPosterior, u: Vector, jacobian: Jacobian) -> tuple[Matrix, Matrix]:
     """W, T (d, d) with W T (W T)' the inverse Hessian of -log-posterior at u (d,); ``jacobian`` (n, located) of residuals.
 
     The Hessian is taken in coordinates that W whitens by Gauss-Newton's approximation, by an orthogonal factor. Where

@@ -1,6 +1,6 @@
 """Tables of a fit: parameters, notes on them, notes on runs, and the check of the engine."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from capsule_id.inference.checks.verdict import declared, informed, trust_words
 from capsule_id.inference.curvature import covariance
 from capsule_id.inference.least_squares import linearised, rows_of
 from capsule_id.inference.point_stage import SampledFit, Widening
+from capsule_id.inference.profiles import identified, profile_tables
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import INSTRUMENT_WORDS, QUANTILE_975, Parameter, is_stated, parameter
@@ -131,7 +132,9 @@ def check_engine(sampled: SampledFit) -> list[Finding]:
 # notes: Tables of the report: those of the experiments and those of the whole fit.
 
 
-def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> list[ResultTable]:
+def make_notes(
+    sampled: SampledFit, predictive: Mapping[str, float | None], profiled: Sequence[str] = ()
+) -> list[ResultTable]:
     """Return all tables; a finding whose facts hold rows of ``alternatives``, models of the same readings, has one too.
 
     Tables that compare bench tests and runs need runs, and derivatives, which say little where residuals have kinks.
@@ -139,6 +142,7 @@ def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> l
     Parameters
     ----------
     predictive : posterior predictive p-values by label; without a sample there is no such table
+    profiled : names of the parameters whose profile likelihoods are computed
     """
     target, fit = sampled.target, sampled.fit
     of_runs, of_bench = (
@@ -160,6 +164,7 @@ def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> l
         if row.prior is not None
     ]
     tables = [*of_runs, *of_bench, *compared, *([] if kinked else share_table(target, fit))]
+    tables += [*identified(target, fit), *profile_tables(target, fit, profiled)]
     tables.append(ResultTable("parameters.priors", pd.DataFrame(priors).set_index("parameter")))
     if sampled.draws:
         # Experiments on the shared friction panel have a p-value too.

@@ -1,5 +1,6 @@
 """Drives of several pieces: pulses through a lag, a recorded force, a prescribed motion of the rod."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -9,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import DRIVES, TABLE, Parameter
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, Record, array_module
 from capsule_id.physics.forces import DEGREE, Series
-from capsule_id.physics.model import Drive, Piece
+from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Piece
 
 # pulses: Pulses of a coil: P_on and P_off in turn, through a first-order lag (the coil's L/R).
 
@@ -326,3 +327,10 @@ def _sample(samples: Samples, index: Any) -> Any:
     index = xp.clip(xp.asarray(index), 0, n - 1)
     table = xp.broadcast_to(_aligned(xp.asarray(samples), index), (*index.shape, n))
     return xp.take_along_axis(table, index[..., None], axis=-1)[..., 0]
+
+
+def capsule_and_drive(values: Mapping[str, Any], drive: str) -> tuple[CapsuleParameters, Excitation | Pulses]:
+    """The model's parameters and the drive of that name (see ``DRIVES``), from values by symbol, SI, () or (batch,)."""
+    p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES if name in values})
+    own = {name: values[name] for name in DRIVES[drive]}
+    return p, Excitation(**own) if drive == "harmonic" else Pulses(**own)

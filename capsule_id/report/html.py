@@ -122,6 +122,14 @@ def drawings(result: Result) -> Iterator[Drawing]:
         alt = f"Traces of every physical parameter, {ensembles}; the largest split R-hat is {max(result.posterior.rhat):.4f}."
         figures.traces(columns, figure := new_figure(*figures.traces_size(columns)))
         yield "traces", "sample", "Traces", caption, figure, alt, ""
+    profiles = [note for note in result.notes if note.code == "parameters.profile"]
+    for name, note in zip(_unique(f"profile_{n.facts['name']}" for n in profiles), profiles, strict=True):
+        caption = caption_of(note, messages_of(result.registry))
+        alt = (
+            f"Profile likelihood of {note.facts['name']}: 95 % interval {note.facts['lower']} to {note.facts['upper']}."
+        )
+        figures.profile(note, ax := new_axes(4.6, 3.4))
+        yield name, "point_fit", f"Profile likelihood of {note.facts['name']}", caption, figure_of(ax), alt, ""
     fit = result.point_fit
     caption = "Where each start began and where it ended, in posterior standard deviations from its curvature."
     alt = f"{counted(len(fit.starts), 'start')}; {int(fit.at_other_maximum.sum())} ended at another maximum than the best."

@@ -729,6 +729,23 @@ FIT_MESSAGES: Mapping[str, Message] = {
             "stated value with its sd (a weighing), or a prior."
         ),
     ),
+    "parameters.identified": Message(
+        "What the readings know",
+        caption=(
+            "bounded: the profile likelihood falls on both sides. upper limit, lower limit: on one side alone. flat: on none, "
+            "so that the prior decides. tied to: the readings know a combination with that parameter better than either. "
+            "Correlation: the largest one with another parameter, from the curvature at the maximum. sd / prior sd: near 1 "
+            "where the readings say nothing."
+        ),
+    ),
+    "parameters.profile": Message(
+        "Profile likelihood of a parameter",
+        caption=(
+            "{name}, {unit}: log-likelihood maximised over all other parameters, which keep their priors, at fixed values; "
+            "and the parabola of the curvature. 95 % interval, where it falls by {drop:.2f}: {lower} to {upper} (open: beyond "
+            "the values). Beside it: the other physical parameters at the maximum."
+        ),
+    ),
     "parameters.priors": Message(
         "Priors",
         caption=(

@@ -39,7 +39,7 @@ from capsule_id.report.figures.style import (
     set_text,
 )
 from capsule_id.rig.model import Table
-from capsule_id.views import Comparison, Curve, Finding, Points, counted, with_unit
+from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable, counted, with_unit
 
 # comparisons: Measured beside predicted: the panels of a ``Comparison``, and where the point fit's starts ended.
 
@@ -250,6 +250,17 @@ def point_fit_starts(fit: PointFit, ax: Axes) -> None:
     ax.set_yticks(rows, [plain_symbol(name) for name in fit.names], parse_math=False)
     ax.set_ylim(-0.8, len(rows) - 0.2)
     set_text(ax, "distance from the best maximum, posterior sd", "", "Starts of the point fit")
+    set_legend(ax, "above")
+
+
+def profile(note: ResultTable, ax: Axes) -> None:
+    """A table of a profile likelihood: the profile, the parabola of the curvature, and the drop of the 95 % interval."""
+    value, drop = note.frame.index.to_numpy(float), note.facts["drop"]
+    ax.plot(value, note.frame["profile"], color=BLUE, marker="o", ms=3.5, lw=1.4, label="profile")
+    ax.plot(value, note.frame["curvature"], color=GREY, ls="--", lw=1.0, label="curvature")
+    ax.axhline(-drop, color=BLACK, ls=":", lw=0.9, label="95 %")
+    ax.set_ylim(-4.0 * drop, 0.4 * drop)
+    set_text(ax, with_unit(plain_symbol(note.facts["name"]), note.facts["unit"]), "log-likelihood less its maximum")
     set_legend(ax, "above")
 
 

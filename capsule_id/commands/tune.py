@@ -1,0 +1,124 @@
+"""``capsule-id tune RESULT``: the settings of drive and rig that maximise the mean velocity under the posterior."""
+
+import argparse
+import json
+from typing import TYPE_CHECKING
+
+from capsule_id.commands import NO_CACHE, PATH
+from capsule_id.commands.compilation import prepare_jax
+from capsule_id.commands.predict import check_new_files
+from capsule_id.commands.simulate import number, whole_number
+from capsule_id.console import Progress, say
+from capsule_id.errors import InputError, check_seed, refusing
+from capsule_id.output import replace_file
+from capsule_id.parameters import LEAVES
+from capsule_id.views import counted
+
+if TYPE_CHECKING:
+    from capsule_id.inference.tuning import Tuning
+
+#: Settled motions that are printed; FILE.json has all.
+MOST_MOTIONS = 5
+
+OPTIONS = {
+    "": (("result", "RESULT", "result directory of fit-params", PATH),),
+    "settings, in SI units: one number fixes a value, two numbers are the bounds of its search": tuple(
+        (f"--{name}", "X", f"{leaf.meaning}, {leaf.unit}", {"nargs": "+"}) for name, leaf in LEAVES.items()
+    ),
+    "search": (
+        ("--spring", "NAME", "fitted support spring that gives k2"),
+        ("--faster-than", "X", "m/s: maximise the probability of a larger mean velocity, not its mean"),
+        ("--draws", "N", "number of draws of the posterior (default 16)", {"default": "16"}),
+        ("--seed", None, "random seed of the draws and of the search (default 0)", {"type": int, "default": 0}),
+    ),
+    "output": (
+        ("--out", "FILE", "FILE.csv: the table; FILE.json: all numbers; a new file", {**PATH, "required": True}),
+        ("--figure", "PNG", "map of the mean velocity, a new file", PATH),
+        ("--quiet", "", "no progress on standard error"),
+        NO_CACHE,
+    ),
+}
+
+
+def run(args: argparse.Namespace) -> int:
+    """Search, print the best setting, write FILE and the figure; 0, or 3 where a check of RESULT failed.
+
+    Raises
+    ------
+    InputError
+        If RESULT is none or holds no sample, a setting is not admissible or missing, or a file exists.
+    """
+    check_seed(args.seed)
+    check_new_files(args)
+    if args.out.suffix not in (".csv", ".json"):
+        raise InputError("--out must end in .csv or .json", args.out.name, "change the suffix", args.out)
+    bounds, given = dict[str, tuple[float, float]](), dict[str, float]()
+    for name in LEAVES:
+        values = [number(name, text) for text in getattr(args, name) or ()]
+        if len(values) > 2:
+            raise InputError(f"--{name} takes one or two numbers", str(len(values)), "give a value, or two bounds")
+        if len(values) == 2:
+            bounds[name] = values[0], values[1]
+        elif values:
+            given[name] = values[0]
+    faster_than = None if args.faster_than is None else number("faster-than", args.faster_than)
+    draws = whole_number("draws", args.draws, 1)
+    prepare_jax(not args.no_cache)
+    from capsule_id.api import load
+    from capsule_id.report.figures.style import mark, own_style, png
+    from capsule_id.report.figures.sweeps import tuned
+
+    result = load(args.result)
+    if result.trust != "trusted":
+        failed = [
+            f"fail {finding.code}: {result.text(finding)}" for finding in result.findings if finding.level == "fail"
+        ]
+        say("\n".join([*failed, result.verdict]), coloured=True)
+    with Progress(not args.quiet, unit="setting") as progress:
+        options = {"faster_than": faster_than, "spring": args.spring, "draws": draws, "seed": args.seed}
+        found = result.tune(bounds, given, **options, progress=progress)
+    frames = {name: getattr(found, name) for name in ("table", "motions", "sensitivity")}
+    saved = {name: json.loads(frame.to_json(orient="index")) for name, frame in frames.items()}
+    saved |= {"best": found.best, "bounds": bounds, "given": given, "seed": args.seed, "draws": draws}
+    saved |= {"failed checks": result.failed, "rig": result.rig.name, "synthetic": result.rig.synthetic}
+    table = found.table.to_csv(float_format="%.6g", lineterminator="\n")
+    written = [
+        ("--out", args.out, (table if args.out.suffix == ".csv" else json.dumps(saved, indent=1) + "\n").encode())
+    ]
+    if args.figure is not None:
+        trust = str(found.table["trust"].iloc[0])
+        with own_style():
+            figure = tuned(found.surface, found.best, found.points, f"{result.rig.name}, {trust}:")
+            if result.rig.synthetic:
+                mark(figure, "synthetic data")
+            written.append(("--figure", args.figure, png(figure)))
+    say(_summary(found))
+    for option, file, content in written:
+        with refusing(f"{option} must be writable", "name another file", file):
+            replace_file(file, content)
+        say(f"wrote {file}")
+    return 0 if result.clean else 3
+
+
+def _summary(found: "Tuning") -> str:
+    """The best setting, what to mind about it, and the tables of motions and sensitivities, as text."""
+    best, share = found.table.iloc[0], found.motions["share"]
+    settings = ", ".join(f"{name} = {value:.4g} {LEAVES[name].unit}" for name, value in found.best.items())
+    interval = f"95 %: {best['lower [mm/s]']:.3g} to {best['upper [mm/s]']:.3g}"
+    lines = [
+        f"best of {counted(found.computed, 'setting')}: {settings}",
+        f"mean velocity {best['predicted [mm/s]']:.3g} mm/s ({interval}), {best['trust']}",
+        *(f"{name} is best at an end of its range: search a wider one" for name in found.at_bound),
+    ]
+    if found.failed:
+        lines.append(f"{counted(found.failed, 'setting')} left out: the motion of a draw could not be computed")
+    lines.append(f"settled motions of this setting, by share of draws and initial states ({len(share)} kinds):")
+    lines.append(found.motions.head(MOST_MOTIONS).to_string(float_format="%.3g"))
+    lines.append("mean velocity where one parameter or setting changes, mm/s:")
+    lines.append(found.sensitivity.to_string(float_format="%.4g"))
+    if len(found.table) > 1:
+        measured = found.table.iloc[1:].sort_values("predicted [mm/s]", ascending=False)
+        lines.append(
+            f"measured operating points, the best prediction first:\n{measured.iloc[:, :-1].to_string(float_format='%.4g')}"
+        )
+    return "\n".join(lines)
