@@ -112,7 +112,7 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], arguments: Sequence[str] | None) -> int:
-    """Parse and act. Every end gives an exit code and at most one line on standard error."""
+    """Parse and act. Every end gives an exit code; on standard error three lines for each fault of the input, else one."""
     try:
         code = _act(program, make_parser, arguments)
     except OutputError as error:
@@ -146,7 +146,7 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         console.finish()
         return int(stop.code or 0)
     except InputError as error:
-        console.complain(error)
+        console.complain(error.shown)
         return BAD_INPUT
     except KeyboardInterrupt:
         console.complain(console.ending(interrupted))

@@ -17,7 +17,7 @@ from typing import (
     runtime_checkable,
 )
 
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.model import SHORTEST_RECORD, ModelChoices, Quantity, S, Settings, Table
@@ -106,11 +106,12 @@ class ChoiceRule:
 
 @dataclass(frozen=True)
 class PlainRule:
-    """A value of TOML as it is. ``rule`` continues "<key> must ..."."""
+    """A value of TOML as it is. ``rule`` continues "<key> must ..."; ``schema``: its JSON schema."""
 
     holds: Callable[[Any], bool]
     rule: str
     remedy: str
+    schema: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def read(self, node: Node) -> Any:
         """See ``SettingRule``."""
@@ -291,9 +292,15 @@ def read_rules(node: Node, rules: Mapping[str, SettingRule]) -> dict[str, Any]:
     Raises
     ------
     InputError
-        At the first value, in the order of the rules, that breaks its rule.
+        At every value that breaks its rule, in the order of the rules.
     """
-    return {key: rule.read(node[key]) for key, rule in rules.items() if key in node}
+    values, faults = dict[str, Any](), list[InputError]()
+    for key, rule in rules.items():
+        if key in node:
+            with collecting(faults):
+                values[key] = rule.read(node[key])
+    raise_all(faults)
+    return values
 
 
 def parameter_rows(kinds: Mapping[str, KindRule]) -> dict[str, Parameter]:
@@ -320,6 +327,16 @@ RIG_QUANTITIES: Mapping[str, QuantityRule] = {
     "slope": SLOPE,
     "N0": PRESSING_FORCE,
 }
+#: Its other keys but ``confirmed``.
+RIG_WORDS: Mapping[str, SettingRule] = {
+    "name": NameRule(),
+    "synthetic": PlainRule(
+        lambda value: isinstance(value, bool),
+        "be true or false",
+        "write true or false without quotes",
+        {"type": "boolean"},
+    ),
+}
 #: Keys of the tables of rig.toml that stand once.
 TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
     "[rig]": ("name", "synthetic", "confirmed", *RIG_QUANTITIES),
@@ -333,6 +350,10 @@ INSTRUMENT_KEYS = ("name", "gain", "offset", "clock")
 # other.
 
 
+#: Choices of ``[model]``.
+MODEL_RULES: Mapping[str, ChoiceRule] = {
+    key: ChoiceRule(get_args(get_type_hints(ModelChoices)[key])) for key in ("friction", "reaction", "engine")
+}
 #: Words that ``free`` may hold.
 OPTIONAL = tuple(symbol for symbol, row in TABLE.items() if row.optional)
 
@@ -365,23 +386,20 @@ def read_model(root: Node) -> ModelChoices:
     """
     head = root.get("model", {}).table("[model]")
     head.refuse_unknown(TABLE_KEYS["[model]"], TABLE_KEYS)
-    choices: dict[str, str] = {}
-    for key in ("friction", "reaction", "engine"):
-        words = get_args(get_type_hints(ModelChoices)[key])
-        choices[key] = head.get(key, words[0]).choice(words)
+    choices = read_rules(head, MODEL_RULES)
     node = head.get("free", [])
     node.require(isinstance(node.value, list), "be a list of words", f'write free = ["{OPTIONAL[0]}"]')
     free = read_words(node, OPTIONAL, "optional parameters", f"write some of {' '.join(OPTIONAL)}")
     if twice := [word for index, word in enumerate(free) if word in free[:index]]:
         raise node.error("free must name each parameter once", shown(twice[0]), "remove the second one")
-    if choices["friction"] == "constant" and "ratio" in free:
+    if choices.get("friction") == "constant" and "ratio" in free:
         raise node.error(
             "constant friction has no ratio",
             shown("ratio"),
             'remove "ratio" from free, or remove friction = "constant"',
         )
     in_order = tuple(symbol for symbol in OPTIONAL if symbol in free)
-    return ModelChoices(free=in_order, **choices)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    return ModelChoices(free=in_order, **choices)
 
 
 def check_engine(root: Node, model: ModelChoices, tables: Sequence[Table[Any]]) -> None:
