@@ -29,7 +29,7 @@ from capsule_id.rig.maps import (
     refuse_idle_errors,
     without_stated_errors,
 )
-from capsule_id.rig.model import ROUNDING, Column, ModelChoices, Quantity, Rig, Settings, Table
+from capsule_id.rig.model import ROUNDING, Column, Quantity, Rig, Settings, Table
 from capsule_id.rig.plateaus import Plateaus, read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
@@ -85,25 +85,15 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     root.refuse_unknown(("rig", "model", "prior", "instrument", "experiment"))
     if "rig" not in root:
         raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", root.document.path, 1, 1)
-    head, faults, words = root["rig"].table("[rig]"), list[InputError](), dict[str, Any]()
-    with collecting(faults):
-        head.refuse_unknown(TABLE_KEYS["[rig]"], TABLE_KEYS)
-        if "name" not in head:
-            raise head.error("[rig] must have a name", "none", 'add name = "..."')
-    with collecting(faults):
-        words = read_rules(head, RIG_WORDS)
-    stated = {"g": Quantity(STANDARD_GRAVITY)}
-    for key, rule in RIG_QUANTITIES.items():
-        if key in head:
-            with collecting(faults):
-                stated[key] = head[key].quantity(rule.si, rule.domain, rule.has_sd)
+    faults = list[InputError]()
+    words, stated = _read_head(root["rig"].table("[rig]"), faults)
     ground = {key: stated[key] for key in ("slope", "N0") if key in stated}
-    rows, priors, model = (*parameter_rows(kinds).values(), *parameters), dict[str, Prior](), ModelChoices()
     tables, files = _read_experiments(root, kinds, ground, faults)
+    rows = (*parameter_rows(kinds).values(), *parameters)
+    with collecting(faults):
+        priors = _read_priors(root, tables, rows, faults)
     with collecting(faults):
         model = read_model(root)
-    with collecting(faults):
-        priors = _read_priors(root, tables, rows, bool(faults))
     raise_all(faults)
     check_masses(root, model, tables, kinds, set(stated))
     check_engine(root, model, tables)
@@ -123,6 +113,22 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         N0=stated.get("N0"),
         confirmed=read_confirmed(root, tables, stated),
     )
+
+
+def _read_head(head: Node, faults: list[InputError]) -> tuple[dict[str, Any], dict[str, Quantity]]:
+    """Words and quantities of [rig]; errors are appended to ``faults``."""
+    words, stated = dict[str, Any](), {"g": Quantity(STANDARD_GRAVITY)}
+    with collecting(faults):
+        head.refuse_unknown(TABLE_KEYS["[rig]"], TABLE_KEYS)
+        if "name" not in head:
+            raise head.error("[rig] must have a name", "none", 'add name = "..."')
+    with collecting(faults):
+        words = read_rules(head, RIG_WORDS)
+    for key, rule in RIG_QUANTITIES.items():
+        if key in head:
+            with collecting(faults):
+                stated[key] = head[key].quantity(rule.si, rule.domain, rule.has_sd)
+    return words, stated
 
 
 def _read_document(folder: Path) -> tuple[Node, str]:
@@ -158,21 +164,21 @@ def _read_document(folder: Path) -> tuple[Node, str]:
 
 
 def _read_priors(
-    root: Node, tables: Sequence[Table], parameters: Sequence[Parameter], faulty: bool
+    root: Node, tables: Sequence[Table], parameters: Sequence[Parameter], faults: list[InputError]
 ) -> dict[str, Prior]:
     """The entries of ``[prior]``, by parameter name; they may state the priors of ``parameters``.
 
-    ``faulty``: an experiment may be missing among ``tables``, and its spring with it.
+    Errors are appended to ``faults``. Where there are some, an experiment may be missing, and its spring with it.
     """
     entries = root.get("prior", {}).table("[prior]")
     rows = {row.symbol: row for row in parameters if row.prior_can_be_stated}
     known = ["k2[<spring>]" if symbol == "k2" else symbol for symbol in sorted(rows, key=lambda s: rows[s].scatter)]
     springs = sorted({table.settings.spring for table in tables if getattr(table.settings, "spring", None)})
-    priors, faults = dict[str, Prior](), list[InputError]()
+    priors, whole = dict[str, Prior](), not faults
     for key in entries.value:
         node, spring = entries[key], re.fullmatch(rf"k2\[({NAME_PATTERN})\]", key)
         with collecting(faults):
-            if spring and spring[1] not in springs and not faulty:
+            if spring and spring[1] not in springs and whole:
                 raise node.error(
                     "a prior of k2 must name a spring of an experiment",
                     spring[1],
@@ -184,7 +190,6 @@ def _read_priors(
             row = rows["k2" if spring else key]
             assert row.prior is not None, "its prior can be stated"
             priors[key] = node.prior(row.unit, row.prior)
-    raise_all(faults)
     return priors
 
 
