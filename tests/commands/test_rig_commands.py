@@ -1,17 +1,21 @@
 """``capsule-id init`` and ``capsule-id check``."""
 
 import argparse
+import json
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from capsule_id.api import read_rig
+from capsule_id.cli import capsule_id
 from capsule_id.commands import add_options, check, init
-from capsule_id.errors import InputError
+from capsule_id.errors import FolderError, InputError
 from capsule_id.experiments.kind import default_registry
 from capsule_id.rig.schema import ChoiceRule
+from tests.cli_tools import DATA
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 
 KINDS = default_registry()
@@ -100,6 +104,60 @@ def test_check_prints_a_line_per_experiment(tmp_path: Path, capsys: pytest.Captu
     assert lines[1] == "free_vibration free_vibration_1: 10 rows of time [ms], x_rel [mm], 1000 Hz"
     assert lines[3] == "static_friction lifted: 2 rows of height [mm], length [mm]"
     assert lines[8] == "forced_run run_01: 9 rows of time [s], x_rel [mm], acceleration_rod [m/s^2], 100 Hz"
+
+
+PROBLEM = {
+    "code", "level", "experiment", "parameters", "file", "line", "column", "rule", "value", "remedy", "text"
+}  # fmt: skip
+
+
+def as_json(folder: Path, capsys: pytest.CaptureFixture) -> tuple[int, dict[str, Any]]:
+    """Exit code and content of ``check --json``."""
+    code = capsule_id(["check", str(folder), "--json"])
+    content = json.loads(capsys.readouterr().out)
+    assert content.keys() == {"format", "rig", "synthetic", "tables", "findings", "errors"}
+    assert content["format"] == "capsule-id check 1"
+    assert all(problem.keys() == PROBLEM for problem in content["findings"] + content["errors"])
+    return code, content
+
+
+def test_check_as_json_holds_the_same_findings(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = write_folder(tmp_path / "rig")
+    code, content = as_json(folder, capsys)
+    assert (code, content["rig"], content["synthetic"], content["errors"]) == (0, "twin", True, [])
+    first, rig = content["tables"][0], read_rig(folder)
+    assert [table["label"] for table in content["tables"]] == [table.label for table in rig.tables]
+    assert first == {
+        "label": "free_vibration_1", "kind": "free_vibration", "file": "free_vibration_1.csv", "rows": 10, "missing": 0,
+        "rejected": 0, "columns": {"time": "ms", "x_rel": "mm"},
+    }  # fmt: skip
+    call(check, str(folder))
+    said = capsys.readouterr().out
+    assert content["findings"]
+    for found in content["findings"]:
+        assert f"{found['level']}: {found['text']}\n" in said
+        assert f"{found['value']} {found['remedy']}".strip() == found["text"]
+
+
+def test_check_as_json_names_the_line_of_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    rows = (DATA / "free_vibration_1.csv").read_text().splitlines()
+    head = '[rig]\nname = "a"\nm1 = { value = 0.1, sd = 0.001, unit = "kg" }\n'
+    text = f'{head}[[experiment]]\nkind = "free_vibration"\nfile = "a.csv"\n'
+    folder = write_folder(tmp_path / "rig", text, {"a.csv": "\n".join([*rows[:50], *rows[53:], ""])})
+    gap = next(found for found in as_json(folder, capsys)[1]["findings"] if found["code"] == "readings.gaps")
+    place = str(folder / "a.csv"), 50, None
+    assert (gap["experiment"], gap["file"], gap["line"], gap["column"]) == ("a", *place)
+
+
+def test_check_as_json_holds_all_errors(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    wrong = RIG_TOML.replace('name = "twin"', 'name = "a b"', 1).replace('kind = "motor_current"', 'kind = "motor"', 1)
+    code, content = as_json(write_folder(tmp_path / "rig", wrong), capsys)
+    assert (code, content["rig"], content["tables"], content["findings"]) == (2, None, [], [])
+    with pytest.raises(FolderError) as caught:
+        read_rig(tmp_path / "rig")
+    assert [error["text"] for error in content["errors"]] == [str(error) for error in caught.value.errors]
+    assert [(error["rule"], error["value"]) for error in content["errors"]][1] == ("unknown kind", "'motor'")
+    assert as_json(tmp_path / "none", capsys)[1]["errors"][0]["remedy"] == "name a folder with a rig.toml"
 
 
 def findings(folder: Path, capsys: pytest.CaptureFixture) -> list[str]:
