@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import (
     Annotated,
     Any,
+    ClassVar,
     Generic,
     Literal,
     Protocol,
@@ -21,7 +22,19 @@ from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.model import SHORTEST_RECORD, ModelChoices, Quantity, S, Settings, Table
-from capsule_id.rig.toml import ANY, INCLINE, POSITIVE, Domain, Node, is_count, remedy_for, shown
+from capsule_id.rig.toml import (
+    ANY,
+    ERRORS,
+    INCLINE,
+    NAME_PATTERN,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Domain,
+    Node,
+    is_count,
+    remedy_for,
+    shown,
+)
 from capsule_id.views import counted
 
 # schema: Types for the columns, settings and rules of a kind of experiment. The reader uses no other type of a kind.
@@ -41,9 +54,24 @@ class ColumnRule:
     usual: tuple[float, float] | None = None
 
 
+def table_schema(keys: Mapping[str, Any], required: Iterable[str] = ()) -> dict[str, Any]:
+    """The JSON schema of a table with these ``keys``, rules of settings or schemas; a rule without one allows any value."""
+    forms = {key: form if isinstance(form, dict) else getattr(form, "schema", {}) for key, form in keys.items()}
+    return {"type": "object", "properties": forms, "required": [*required], "additionalProperties": False}
+
+
+def number_schema(domain: Domain) -> dict[str, Any]:
+    """The JSON schema of a number whose ``domain`` has a lower end of 0, in any unit, or no lower end."""
+    bound = {"minimum" if domain.closed else "exclusiveMinimum": domain.low}
+    return {"type": "number", **(bound if domain.low >= 0.0 else {})}
+
+
 @runtime_checkable
 class SettingRule(Protocol):
-    """Reads one setting. A kind may define its own rule: any object with this method."""
+    """Reads one setting. A kind may define its own rule: any object with this method.
+
+    Its JSON schema, for the help of editors, may stand in an attribute ``schema``.
+    """
 
     def read(self, node: Node) -> object:
         """The checked value of ``node``, as stored in the settings.
@@ -72,6 +100,13 @@ class QuantityRule:
         """See ``SettingRule``."""
         quantity = node.quantity(self.si, self.domain, self.has_sd)
         return quantity if self.has_sd else quantity.value
+
+    @property
+    def schema(self) -> dict[str, Any]:
+        """Its JSON schema."""
+        errors = dict.fromkeys(ERRORS if self.has_sd else (), number_schema(NOT_NEGATIVE))
+        unit = {"type": "string", "description": f"{self.si}, or an equivalent unit"}
+        return table_schema({"value": number_schema(self.domain), **errors, "unit": unit}, ("value", "unit"))
 
 
 #: Slope of the track and force that presses the capsule down.
@@ -103,6 +138,11 @@ class ChoiceRule:
         """See ``SettingRule``."""
         return node.choice(self.choices)
 
+    @property
+    def schema(self) -> dict[str, Any]:
+        """Its JSON schema."""
+        return {"enum": [*self.choices]}
+
 
 @dataclass(frozen=True)
 class PlainRule:
@@ -133,10 +173,22 @@ class WordsRule:
         # Words of a list have no place of their own.
         return tuple(replace(node, value=word).choice(self.choices) for word in node.value)
 
+    @property
+    def schema(self) -> dict[str, Any]:
+        """Its JSON schema."""
+        word = ChoiceRule(self.choices).schema
+        return {"anyOf": [word, {"type": "array", "items": word, "minItems": 1}]}
+
+
+#: JSON schema of a whole number, 1 or more.
+WHOLE = {"type": "integer", "minimum": 1}
+
 
 @dataclass(frozen=True)
 class NameRule:
     """A name of letters, digits, dot, underscore, hyphen."""
+
+    schema: ClassVar = {"type": "string", "pattern": f"^{NAME_PATTERN}$"}
 
     def read(self, node: Node) -> str:
         """See ``SettingRule``."""
@@ -144,7 +196,7 @@ class NameRule:
 
 
 #: A whole number, 1 or more.
-COUNT = PlainRule(is_count, "be a whole number, 1 or more", "write e.g. 10")
+COUNT = PlainRule(is_count, "be a whole number, 1 or more", "write e.g. 10", WHOLE)
 
 
 @dataclass(frozen=True)
