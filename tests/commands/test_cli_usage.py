@@ -50,6 +50,15 @@ def test_help_is_quick_and_light(tmp_path: Path, name: str, words: tuple[str, ..
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_check_of_bench_tests_loads_what_it_needs(tmp_path: Path) -> None:
+    """No pandas, no figures, no sampler: they take as long as the check itself."""
+    report = "import atexit, sys\natexit.register(lambda: print('loaded', *sys.modules, file=sys.stderr))\n"
+    rig = small_rig(tmp_path / "rig", tables=("static_friction", "motor_current"))
+    done = run("check", str(rig), cwd=tmp_path, name="capsule_id", before=report)
+    assert done.returncode == 0
+    assert not set(done.stderr.split()) & set(HEAVY) - {"jax", "equinox"}
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [
