@@ -187,7 +187,7 @@ def test_errors_are_one_message_and_write_nothing(
 ) -> None:
     assert _run(*words, "--quiet") == 2
     said = capsys.readouterr()
-    assert rule in said.err
+    assert rule in message(said.err)
     assert (message(said.err).count("\n"), said.out) == (1, "")
     assert listing(Path()) == {}
 
