@@ -41,45 +41,45 @@ def run(args: argparse.Namespace) -> int:
         If the folder is not a valid rig, or DIR cannot be written.
     """
     try:
-        _check(args)
+        say(_checked(args), coloured=not args.json)
     except InputError as error:
         if args.json:
             faults = [_problem(each, "input", "error") for each in getattr(error, "errors", (error,))]
-            _say_json({"rig": None, "synthetic": None, "tables": [], "findings": [], "errors": faults})
+            say(_as_json(errors=faults))
         raise
     return 0
 
 
-def _check(args: argparse.Namespace) -> None:
-    """Read, judge and print the rig; errors as of ``run``."""
+def _checked(args: argparse.Namespace) -> str:
+    """Read and judge the rig; the text to print. Errors as of ``run``."""
     kinds = default_registry()
     rig = read_rig(rig_folders([args.data] if args.data is not None else [])[0], kinds)
     findings = (*lint(rig, kinds, rig.tables), *lint_settings(rig, kinds, rough_values(rig, kinds)))
     messages = messages_of(kinds)
     drawn = _draw(rig, findings, args.figures) if args.figures is not None else []
     if args.json:
-        tables, found = [_columns(table) for table in rig.tables], [_told(each, rig, messages) for each in findings]
-        _say_json({"rig": rig.name, "synthetic": rig.synthetic, "tables": tables, "findings": found, "errors": []})
-        return
+        tables, told = [_columns(table) for table in rig.tables], [_told(each, rig, messages) for each in findings]
+        return _as_json(rig=rig.name, synthetic=rig.synthetic, tables=tables, findings=told)
     lines = [f"{rig.name}: {counted(len(rig.tables), 'experiment')}{', SYNTHETIC data' if rig.synthetic else ''}"]
     lines += [_summary(table) for table in rig.tables]
     lines += [f"{table.label}: {line}" for table in rig.tables for line in kinds[table.kind].describe(table)]
     lines += [f"{finding.level}: {finding_text(finding, messages)}" for finding in findings]
     lines += [*drawn, counted(len(findings), "finding") if findings else "no findings"]
-    say("\n".join(lines), coloured=True)
+    return "\n".join(lines)
 
 
-def _say_json(content: Mapping[str, Any]) -> None:
-    say(json.dumps({"format": FORMAT, **content}, indent=1, ensure_ascii=False, allow_nan=False))
+def _as_json(**content: Any) -> str:
+    """The text of ``--json``; ``content`` holds some of its keys."""
+    empty = {"format": FORMAT, "rig": None, "synthetic": None, "tables": [], "findings": [], "errors": []}
+    return json.dumps(empty | content, indent=1, ensure_ascii=False, allow_nan=False)
 
 
 def _columns(table: Table) -> dict[str, Any]:
     """A table for ``--json``."""
-    units = {column.name: column.unit for column in table.columns.values()}
     return {
         **{key: getattr(table, key) for key in ("label", "kind", "file", "missing", "rejected")},
         "rows": len(table.rows),
-        "columns": units,
+        "columns": {column.name: column.unit for column in table.columns.values()},
     }
 
 

@@ -47,22 +47,27 @@ def template(kinds: Registry, name: str, entries: Sequence[str] | None = None) -
 
 #: JSON schemas of plain values.
 _TEXT, _NUMBER, _COLUMN = {"type": "string"}, {"type": "number"}, {"type": ["string", "integer"], "minimum": 1}
+_TEXTS = {"type": "array", "items": _TEXT}
 
 
 def entry_schema(kind: KindRule, names: Sequence[str]) -> dict[str, Any]:
     """The JSON schema of an experiment of ``kind``; ``names``: of all kinds."""
     column = {"from": _COLUMN, "minus": _COLUMN, "unit": _TEXT, "scale": _NUMBER, "offset": _NUMBER}
     source = {"anyOf": [table_schema(column, ("from", "unit")), table_schema({"rate": QuantityRule("Hz")}, ("rate",))]}
-    wanted = {"anyOf": [{"type": ["string", "number"]}, table_schema({"min": _NUMBER, "max": _NUMBER})]}
     plateaus = {"levels": {"type": "array", "items": _NUMBER, "minItems": 2}, "unit": _TEXT, "guard": DurationRule()}
     keys = {
         "kind": {"enum": names},
         "file": _TEXT,
-        "files": {"type": "array", "items": _TEXT, "minItems": 1},
+        "files": {**_TEXTS, "minItems": 1},
         "label": NameRule(),
         "columns": table_schema({name: {**source} for name in ("time", *kind.columns)}) | {"minProperties": 1},
         **LAYOUT,
-        "where": {"type": "object", "additionalProperties": wanted},
+        "where": {
+            "type": "object",
+            "additionalProperties": {
+                "anyOf": [{"type": ["string", "number"]}, table_schema({"min": _NUMBER, "max": _NUMBER})]
+            },
+        },
         "plateaus": table_schema(plateaus, ("levels", "unit")),
         "reject": table_schema(REJECT, REJECT),
         "clock": table_schema(CLOCK),
@@ -98,20 +103,23 @@ def rig_schema(kinds: Registry) -> dict[str, Any]:
         for symbol, row in kinds.parameters.items()
         if row.prior_can_be_stated
     }
-    of_springs = {rf"^k2\[{NAME_PATTERN}\]$": priors.pop("k2")}
+    springs = {"patternProperties": {rf"^k2\[{NAME_PATTERN}\]$": priors.pop("k2")}}
     error = table_schema({**QuantityRule("1", ANY, has_sd=True).schema["properties"], "unit": _TEXT}, ("unit",))
-    free = {"type": "array", "items": {"enum": OPTIONAL}, "uniqueItems": True}
-    instrument = table_schema({"name": NameRule(), "gain": error, "offset": error, "clock": error}, ("name",))
-    confirmed = {"type": "array", "items": _TEXT}
+    instrument = {"name": NameRule(), "gain": error, "offset": error, "clock": error}
     tables = {
-        "rig": table_schema({**RIG_WORDS, **RIG_QUANTITIES, "confirmed": confirmed}, ("name",)),
-        "model": table_schema({**MODEL_RULES, "free": free}),
-        "prior": table_schema(priors) | {"patternProperties": of_springs},
-        "instrument": {"type": "array", "items": instrument},
+        "rig": table_schema({**RIG_WORDS, **RIG_QUANTITIES, "confirmed": _TEXTS}, ("name",)),
+        "model": table_schema(
+            {**MODEL_RULES, "free": {"type": "array", "items": {"enum": OPTIONAL}, "uniqueItems": True}}
+        ),
+        "prior": table_schema(priors) | springs,
+        "instrument": {"type": "array", "items": table_schema(instrument, ("name",))},
         "experiment": {"type": "array", "minItems": 1, "items": {"allOf": [every, *chosen]}},
     }
-    head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "rig.toml of capsule-id"}
-    return head | table_schema(tables, ("rig", "experiment"))
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": "rig.toml of capsule-id",
+        **table_schema(tables, ("rig", "experiment")),
+    }
 
 
 def _prior_schema(unit: str, prior: Prior | None) -> dict[str, Any]:

@@ -62,8 +62,8 @@ def table_schema(keys: Mapping[str, Any], required: Iterable[str] = ()) -> dict[
 
 def number_schema(domain: Domain) -> dict[str, Any]:
     """The JSON schema of a number whose ``domain`` has a lower end of 0, in any unit, or no lower end."""
-    bound = {"minimum" if domain.closed else "exclusiveMinimum": domain.low}
-    return {"type": "number", **(bound if domain.low >= 0.0 else {})}
+    end = "minimum" if domain.closed else "exclusiveMinimum"
+    return {"type": "number", **({end: domain.low} if domain.low >= 0.0 else {})}
 
 
 @runtime_checkable
@@ -104,9 +104,12 @@ class QuantityRule:
     @property
     def schema(self) -> dict[str, Any]:
         """Its JSON schema."""
-        errors = dict.fromkeys(ERRORS if self.has_sd else (), number_schema(NOT_NEGATIVE))
-        unit = {"type": "string", "description": f"{self.si}, or an equivalent unit"}
-        return table_schema({"value": number_schema(self.domain), **errors, "unit": unit}, ("value", "unit"))
+        keys = {
+            "value": number_schema(self.domain),
+            **dict.fromkeys(ERRORS if self.has_sd else (), number_schema(NOT_NEGATIVE)),
+            "unit": {"type": "string", "description": f"{self.si}, or an equivalent unit"},
+        }
+        return table_schema(keys, ("value", "unit"))
 
 
 #: Slope of the track and force that presses the capsule down.
@@ -176,7 +179,7 @@ class WordsRule:
     @property
     def schema(self) -> dict[str, Any]:
         """Its JSON schema."""
-        word = ChoiceRule(self.choices).schema
+        word = {"enum": [*self.choices]}
         return {"anyOf": [word, {"type": "array", "items": word, "minItems": 1}]}
 
 

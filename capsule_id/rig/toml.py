@@ -358,8 +358,9 @@ class Node:
             if key not in known:
                 table = next((name for name, keys in (elsewhere or {}).items() if key in keys), None)
                 remedy = f"move it to {table}" if table else remedy_for(key, known, "remove it", "write {}")
-                remedy = f"{remedy}; known: {' '.join(known)}"
-                faults.append(self[key].error("unknown key", shown(key), remedy, of_key=True))
+                faults.append(
+                    self[key].error("unknown key", shown(key), f"{remedy}; known: {' '.join(known)}", of_key=True)
+                )
         raise_all(faults)
 
     def table(self, example: str, known: Collection[str] = ()) -> "Node":
