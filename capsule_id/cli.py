@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
@@ -129,7 +130,7 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], arguments: Sequence[str] | None) -> int:
-    """Parse and act. Every end gives an exit code and at most one line on standard error."""
+    """Parse and act. Every end gives an exit code; on standard error a line for each fault of the input, or else one."""
     try:
         code = _act(program, make_parser, arguments)
     except OutputError as error:
@@ -163,7 +164,7 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         console.finish()
         return int(stop.code or 0)
     except InputError as error:
-        console.complain(error)
+        console.complain(error.shown if sys.stderr.isatty() else error)
         return BAD_INPUT
     except KeyboardInterrupt:
         console.complain(console.ending(interrupted))

@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def printable(text: str) -> str:
 
 
 class InputError(ValueError):
-    """Bad input. A command prints it in one line and returns exit code 2.
+    """Bad input. A command prints it, on a terminal as ``shown``, and returns exit code 2; the message is one line.
 
     Parameters
     ----------
@@ -45,9 +45,19 @@ class InputError(ValueError):
         self.rule, self.value, self.remedy = rule, value, remedy
         self.file, self.line, self.column = str(file), line, column
         place = ":".join(str(part) for part in (self.file, line, column) if part not in ("", None))
-        message = f"{rule}, {value}, {remedy}"
-        text = " ".join((f"{place}: {message}" if place else message).split())
-        super().__init__(printable(text))
+        self._place = f"{place}: " * bool(place)
+        super().__init__(_line(f"{self._place}{rule}, {value}, {remedy}"))
+
+    @property
+    def shown(self) -> str:
+        """Three lines: the place and what was found, the rule, what to do."""
+        lines = f"{self._place}found: {self.value}", f"rule: {self.rule}", f"to do: {self.remedy}"
+        return "\n  ".join(map(_line, lines))
+
+
+def _line(text: str) -> str:
+    """``text`` in one line, printable."""
+    return printable(" ".join(text.split()))
 
 
 #: Most errors that are printed at once.
@@ -55,7 +65,7 @@ MOST_SHOWN = 20
 
 
 class FolderError(InputError):
-    """Several errors of a rig folder: the text has a line for each of the first 20, then their number if there are more.
+    """Several errors of a rig folder: message and ``shown`` have the first 20, then their number if there are more.
 
     Attributes
     ----------
@@ -68,8 +78,16 @@ class FolderError(InputError):
         self.errors = tuple(errors)
 
     def __str__(self) -> str:
-        lines = [str(error) for error in self.errors[:MOST_SHOWN]]
-        return "\n".join([*lines, f"{len(self.errors)} errors"] if len(self.errors) > MOST_SHOWN else lines)
+        return self._first(str)
+
+    @property
+    def shown(self) -> str:
+        """Three lines for each error."""
+        return self._first(lambda error: error.shown)
+
+    def _first(self, text: Callable[[InputError], str]) -> str:
+        more = [f"{len(self.errors)} errors"] * (len(self.errors) > MOST_SHOWN)
+        return "\n".join([*map(text, self.errors[:MOST_SHOWN]), *more])
 
 
 def check_seed(seed: int) -> None:
@@ -128,15 +146,18 @@ def refusing(rule: str, remedy: str, file: str | Path = "") -> Iterator[None]:
 
 @contextmanager
 def collecting(errors: list[InputError]) -> Iterator[None]:
-    """Append an ``InputError`` of the body to ``errors`` instead of raising it."""
+    """Append an ``InputError`` of the body, or the several of a ``FolderError``, to ``errors`` instead of raising it."""
     try:
         yield
+    except FolderError as error:
+        errors += error.errors
     except InputError as error:
         errors.append(error)
 
 
 def raise_all(errors: Sequence[InputError]) -> None:
-    """Raise the only error as it is, several as ``FolderError``; return if there is none."""
+    """Raise the only error as it is, several different ones as ``FolderError``; return if there is none."""
+    errors = [*{str(error): error for error in errors}.values()]
     if len(errors) == 1:
         raise errors[0]
     if errors:

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -51,6 +52,12 @@ def run(
         stdin=subprocess.DEVNULL,
         check=False,
     )
+
+
+def message(err: str) -> str:
+    """The printed errors, of three lines each, as their messages: ``place: rule, value, remedy``; other lines as they are."""
+    form = r"(?m)^(.+: )?found: (.*)\n  rule: (.*)\n  to do: (.*)$"
+    return re.sub(form, lambda part: f"{part[1] or ''}{part[3]}, {part[2]}, {part[4]}", err)
 
 
 def parsers() -> list[argparse.ArgumentParser]:

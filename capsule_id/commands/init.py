@@ -1,16 +1,33 @@
 """``capsule-id init DIR``: a rig folder with a commented ``rig.toml`` to fill in, or one that reads the given exports."""
 
 import argparse
+import json
 import re
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from capsule_id.console import say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.importing import entry_of, read_file
 from capsule_id.output import replace_files
-from capsule_id.rig.toml import NAME_PATTERN
+from capsule_id.parameters import Prior
+from capsule_id.rig.maps import CLOCK, LAYOUT
+from capsule_id.rig.plateaus import REJECT, DurationRule
+from capsule_id.rig.schema import (
+    MODEL_RULES,
+    OPTIONAL,
+    RIG_QUANTITIES,
+    RIG_WORDS,
+    KindRule,
+    NameRule,
+    QuantityRule,
+    number_schema,
+    table_schema,
+)
+from capsule_id.rig.toml import ANY, NAME_PATTERN, PRIOR_KEYS
 
 #: The head of ``rig.toml``. Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
 HEAD = Path(__file__).with_name("template.toml")
@@ -26,6 +43,90 @@ def template(kinds: Registry, name: str, entries: Sequence[str] | None = None) -
         head = head.replace(f"@{kind.upper()}@", " ".join(words))
     head = head.replace("@OPTIONAL@", " ".join(row.symbol for row in kinds.parameters.values() if row.optional))
     return "\n".join([head, *(entries or [kind.template for kind in kinds.values()])])
+
+
+#: JSON schemas of plain values.
+_TEXT, _NUMBER, _COLUMN = {"type": "string"}, {"type": "number"}, {"type": ["string", "integer"], "minimum": 1}
+_TEXTS = {"type": "array", "items": _TEXT}
+
+
+def entry_schema(kind: KindRule, names: Sequence[str]) -> dict[str, Any]:
+    """The JSON schema of an experiment of ``kind``; ``names``: of all kinds."""
+    column = {"from": _COLUMN, "minus": _COLUMN, "unit": _TEXT, "scale": _NUMBER, "offset": _NUMBER}
+    source = {"anyOf": [table_schema(column, ("from", "unit")), table_schema({"rate": QuantityRule("Hz")}, ("rate",))]}
+    plateaus = {"levels": {"type": "array", "items": _NUMBER, "minItems": 2}, "unit": _TEXT, "guard": DurationRule()}
+    keys = {
+        "kind": {"enum": names},
+        "file": _TEXT,
+        "files": {**_TEXTS, "minItems": 1},
+        "label": NameRule(),
+        "columns": table_schema({name: {**source} for name in ("time", *kind.columns)}) | {"minProperties": 1},
+        **LAYOUT,
+        "where": {
+            "type": "object",
+            "additionalProperties": {
+                "anyOf": [{"type": ["string", "number"]}, table_schema({"min": _NUMBER, "max": _NUMBER})]
+            },
+        },
+        "plateaus": table_schema(plateaus, ("levels", "unit")),
+        "reject": table_schema(REJECT, REJECT),
+        "clock": table_schema(CLOCK),
+        **{f"{name}_{error}": QuantityRule(r.si) for name, r in kind.columns.items() for error in ("sd", "resolution")},
+        **{f"{name}_instrument": _TEXT for name in kind.columns},
+        **kind.setting_rules,
+    }
+    return table_schema(keys, ("kind", *kind.required)) | {"anyOf": [{"required": ["file"]}, {"required": ["files"]}]}
+
+
+def rig_schema(kinds: Registry) -> dict[str, Any]:
+    """The JSON schema of ``rig.toml``, for editors: tables, keys, types and words; ``capsule-id check`` judges the rest."""
+    entries = {name: entry_schema(kind, [*kinds]) for name, kind in kinds.items()}
+    forms: dict[str, list[object]] = {}
+    for key, form in chain.from_iterable(entry["properties"].items() for entry in entries.values()):
+        forms.setdefault(key, []).extend([form] * (form not in forms.get(key, [])))
+    # Editors complete by the keys of all kinds: few of them follow an "if".
+    every = table_schema({key: {"anyOf": each} if each[1:] else each[0] for key, each in forms.items()}, ("kind",))
+    chosen = [
+        {
+            "if": {"properties": {"kind": {"enum": [name]}}, "required": ["kind"]},
+            "then": {
+                "properties": {key: form for key, form in entry["properties"].items() if forms[key][1:]},
+                "propertyNames": {"enum": [*entry["properties"]]},
+                "required": entry["required"],
+                "anyOf": entry["anyOf"],
+            },
+        }
+        for name, entry in entries.items()
+    ]
+    priors = {
+        symbol: _prior_schema(row.unit, row.prior)
+        for symbol, row in kinds.parameters.items()
+        if row.prior_can_be_stated
+    }
+    springs = {"patternProperties": {rf"^k2\[{NAME_PATTERN}\]$": priors.pop("k2")}}
+    error = table_schema({**QuantityRule("1", ANY, has_sd=True).schema["properties"], "unit": _TEXT}, ("unit",))
+    instrument = {"name": NameRule(), "gain": error, "offset": error, "clock": error}
+    tables = {
+        "rig": table_schema({**RIG_WORDS, **RIG_QUANTITIES, "confirmed": _TEXTS}, ("name",)),
+        "model": table_schema(
+            {**MODEL_RULES, "free": {"type": "array", "items": {"enum": OPTIONAL}, "uniqueItems": True}}
+        ),
+        "prior": table_schema(priors) | springs,
+        "instrument": {"type": "array", "items": table_schema(instrument, ("name",))},
+        "experiment": {"type": "array", "minItems": 1, "items": {"allOf": [every, *chosen]}},
+    }
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": "rig.toml of capsule-id",
+        **table_schema(tables, ("rig", "experiment")),
+    }
+
+
+def _prior_schema(unit: str, prior: Prior | None) -> dict[str, Any]:
+    """The JSON schema of an entry of [prior] in place of ``prior``; a unit of 1 is optional."""
+    assert prior is not None, "it can be stated"
+    keys = {key: number_schema(domain) for key, domain in PRIOR_KEYS[prior.kind].items()}
+    return table_schema({**keys, "unit": {**_TEXT, "description": unit}}, (*keys, *["unit"] * (unit != "1")))
 
 
 OPTIONS = {
@@ -63,7 +164,8 @@ def run(args: argparse.Namespace) -> int:
         name = folder.resolve().name
         usable = re.fullmatch(NAME_PATTERN, name) and name.strip(".")
         text = template(kinds, name if usable else "rig", [entry for entry, _ in guesses.values()])
-        contents = {"rig.toml": text.encode(), **contents}
+        schema = json.dumps(rig_schema(kinds), separators=(",", ":")) + "\n"
+        contents = {"rig.toml": text.encode(), "rig.schema.json": schema, **contents}
         # A part of a table would be read as a table.
         replace_files({folder / file: text for file, text in contents.items() if (folder / file).resolve() not in own})
     if not files:

@@ -15,7 +15,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 from scipy import stats
 
 from capsule_id.experiments.base import (
@@ -388,6 +387,8 @@ def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int])
 
 def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
     """Compare the slopes with and without flagged rows and the paper's ordinary line."""
+    import pandas as pd  # half a second, which capsule-id check does without
+
     rows = []
     for e in lines:
         theta, left_out = e.local(fit.values), fit.flagged.get(e.label, [])

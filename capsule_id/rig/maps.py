@@ -14,6 +14,7 @@ from capsule_id.rig.formats.text import seconds_of_stamps
 from capsule_id.rig.model import NO_DRIFT, SAME, Column, Instrument, Quantity, Table
 from capsule_id.rig.schema import (
     INSTRUMENT_KEYS,
+    WHOLE,
     ChoiceRule,
     ColumnRule,
     KindRule,
@@ -32,7 +33,7 @@ from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si
 
 
 _CLOCK_EXAMPLE = '{ offset = { value = 0.3, unit = "ms" }, drift = { value = 20, sd = 2, unit = "ppm" } }'
-_CLOCK: Mapping[str, SettingRule] = {
+CLOCK: Mapping[str, SettingRule] = {
     "offset": QuantityRule("s", ANY, has_sd=True),
     "drift": QuantityRule("1", ANY, has_sd=True),
 }
@@ -51,10 +52,10 @@ def on_reference(node: Node, raw: RawTable) -> tuple[RawTable, Quantity]:
     node.table(_CLOCK_EXAMPLE)
     if "value" in node:  # of an instrument: the drift alone
         node = replace(node, value={"drift": node.value})
-    node.refuse_unknown(tuple(_CLOCK))
+    node.refuse_unknown(tuple(CLOCK))
     if not node.value:
         raise node.error("a clock must have an offset or a drift", "none", f"write {_CLOCK_EXAMPLE}")
-    stated = read_rules(node, _CLOCK)
+    stated = read_rules(node, CLOCK)
     for key, largest, unit, remedy in (
         ("offset", LARGEST_OFFSET, " s", "check number and unit"),
         ("drift", LARGEST_DRIFT, "", 'check number and unit; 20 ppm is { value = 20, unit = "ppm" }'),
@@ -198,20 +199,23 @@ def without_stated_errors(entry: Node, column: Column, kind: KindRule) -> Column
 # declared: Reads the column map of an experiment in ``rig.toml``: ``columns`` and the keys that go with it.
 
 
-_LAYOUT: Mapping[str, SettingRule] = {
+LAYOUT: Mapping[str, SettingRule] = {
     "data_from_line": PlainRule(
-        is_count, "be a line, counted from 1", "write the line of the first reading, such as 2"
+        is_count, "be a line, counted from 1", "write the line of the first reading, such as 2", WHOLE
     ),
-    "data_to_line": PlainRule(is_count, "be a line, counted from 1", "write the line of the last reading, such as 2"),
+    "data_to_line": PlainRule(
+        is_count, "be a line, counted from 1", "write the line of the last reading, such as 2", WHOLE
+    ),
     "missing": PlainRule(
         lambda value: isinstance(value, list) and all(isinstance(text, str) for text in value),
         "be a list of texts",
         'write missing = ["--", "NaN"]',
+        {"type": "array", "items": {"type": "string"}},
     ),
     "decimal": ChoiceRule((".", ",")),
 }
 #: Keys of an experiment that go with ``columns``.
-MAP_KEYS = ("columns", "files", *_LAYOUT, "where", "plateaus")
+MAP_KEYS = ("columns", "files", *LAYOUT, "where", "plateaus")
 #: A finite number without unit.
 NUMBER = PlainRule(is_number, "be a finite number", "write a number without quotes")
 _EXAMPLE = '{ from = "...", unit = "..." }'
@@ -283,7 +287,7 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
     InputError
         At the key or value of ``rig.toml`` that is wrong.
     """
-    stated = read_rules(entry, _LAYOUT)
+    stated = read_rules(entry, LAYOUT)
     layout = Layout(**{**stated, "missing": (*NO_READING, *stated.get("missing", ()))})
     first, last = layout.data_from_line, layout.data_to_line
     if first is not None and last is not None and last < first:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,6 +26,8 @@ _DURATION = re.compile(r"\s*([+-]?[0-9]+\.?[0-9]*(?:[eE][+-]?[0-9]+)?)\s*([^\s0-
 class DurationRule:
     """A duration such as "50 ms"."""
 
+    schema: ClassVar = {"type": "string", "description": "such as 50 ms"}
+
     def read(self, node: Node) -> float:
         """See ``SettingRule``; s."""
         text, remedy = node.text(), f'write {node.key} = "50 ms"'
@@ -39,10 +42,15 @@ class DurationRule:
         return duration
 
 
-_REJECT: Mapping[str, SettingRule] = {
+REJECT: Mapping[str, SettingRule] = {
     "rule": ChoiceRule(("hampel",)),
     "window": DurationRule(),
-    "n_sd": PlainRule(lambda value: is_number(value) and value >= 1, "be a number, 1 or more", "write n_sd = 5"),
+    "n_sd": PlainRule(
+        lambda value: is_number(value) and value >= 1,
+        "be a number, 1 or more",
+        "write n_sd = 5",
+        {"type": "number", "minimum": 1},
+    ),
 }
 
 
@@ -63,10 +71,10 @@ def without_outliers(node: Node, raw: RawTable, times: Callable[[RawTable], np.n
         At a key or value of the rule; if the table has no times, or the window holds less than two sampling steps or does
         not fit into the record.
     """
-    node.table(_REJECT_EXAMPLE, tuple(_REJECT))
-    for key in _REJECT:
+    node.table(_REJECT_EXAMPLE, tuple(REJECT))
+    for key in REJECT:
         node.required(key, f"write {_REJECT_EXAMPLE}")
-    stated = read_rules(node, _REJECT)
+    stated = read_rules(node, REJECT)
     if "time" not in raw.names:
         raise node.error(
             "reject needs a record with times",

@@ -33,10 +33,12 @@ from capsule_id.rig.model import ROUNDING, Column, Quantity, Rig, Settings, Tabl
 from capsule_id.rig.plateaus import Plateaus, read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
+    RIG_WORDS,
     TABLE_KEYS,
     ColumnRule,
     Entry,
     KindRule,
+    NameRule,
     check_engine,
     check_masses,
     check_normal_forces,
@@ -76,40 +78,33 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     Raises
     ------
     InputError
-        At the first fault: file, line and column, the rule, the value found, the remedy. Where several quantities of
-        [rig] or experiments have faults, at the first one of each (``FolderError``).
+        At a fault: file, line and column, the rule, the value found, the remedy. Several are a ``FolderError``: those of
+        rig.toml, and of every experiment the first one in its files. What depends on faulty parts is not judged.
     """
     root, sha256 = _read_document(Path(folder))
     root.refuse_unknown(("rig", "model", "prior", "instrument", "experiment"))
     if "rig" not in root:
         raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", root.document.path, 1, 1)
-    head = root["rig"].table("[rig]")
-    head.refuse_unknown(TABLE_KEYS["[rig]"], TABLE_KEYS)
-    if "name" not in head:
-        raise head.error("[rig] must have a name", "none", 'add name = "..."')
-    name, synthetic = head["name"].name(), head.get("synthetic", False)
-    synthetic.require(isinstance(synthetic.value, bool), "be true or false", "write true or false without quotes")
-    faults: list[InputError] = []
-    stated = {"g": Quantity(STANDARD_GRAVITY)}
-    for key, rule in RIG_QUANTITIES.items():
-        if key in head:
-            with collecting(faults):
-                stated[key] = head[key].quantity(rule.si, rule.domain, rule.has_sd)
+    faults = list[InputError]()
+    words, stated = _read_head(root["rig"].table("[rig]"), faults)
     ground = {key: stated[key] for key in ("slope", "N0") if key in stated}
     tables, files = _read_experiments(root, kinds, ground, faults)
+    rows = (*parameter_rows(kinds).values(), *parameters)
+    with collecting(faults):
+        priors = _read_priors(root, tables, rows, faults)
+    with collecting(faults):
+        model = read_model(root)
     raise_all(faults)
-    model = read_model(root)
     check_masses(root, model, tables, kinds, set(stated))
     check_engine(root, model, tables)
     check_normal_forces(root, tables, stated)
-    rows = [*parameter_rows(kinds).values(), *parameters]
     return Rig(
-        name=name,
-        synthetic=synthetic.value,
+        name=words["name"],
+        synthetic=words.get("synthetic", False),
         m1=stated.get("m1"),
         m2=stated.get("m2"),
         g=stated["g"],
-        priors=MappingProxyType(_read_priors(root, tables, rows)),
+        priors=MappingProxyType(priors),
         tables=tables,
         files=MappingProxyType({"rig.toml": sha256, **files}),
         folder=root.document.path.parent,
@@ -118,6 +113,22 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         N0=stated.get("N0"),
         confirmed=read_confirmed(root, tables, stated),
     )
+
+
+def _read_head(head: Node, faults: list[InputError]) -> tuple[dict[str, Any], dict[str, Quantity]]:
+    """Words and quantities of [rig]; errors are appended to ``faults``."""
+    words, stated = dict[str, Any](), {"g": Quantity(STANDARD_GRAVITY)}
+    with collecting(faults):
+        head.refuse_unknown(TABLE_KEYS["[rig]"], TABLE_KEYS)
+        if "name" not in head:
+            raise head.error("[rig] must have a name", "none", 'add name = "..."')
+    with collecting(faults):
+        words = read_rules(head, RIG_WORDS)
+    for key, rule in RIG_QUANTITIES.items():
+        if key in head:
+            with collecting(faults):
+                stated[key] = head[key].quantity(rule.si, rule.domain, rule.has_sd)
+    return words, stated
 
 
 def _read_document(folder: Path) -> tuple[Node, str]:
@@ -152,41 +163,47 @@ def _read_document(folder: Path) -> tuple[Node, str]:
     return Node(document, (), document.data), hashlib.sha256(content).hexdigest()
 
 
-def _read_priors(root: Node, tables: Sequence[Table], parameters: Sequence[Parameter]) -> dict[str, Prior]:
-    """The entries of ``[prior]``, by parameter name; they may state the priors of ``parameters``."""
+def _read_priors(
+    root: Node, tables: Sequence[Table], parameters: Sequence[Parameter], faults: list[InputError]
+) -> dict[str, Prior]:
+    """The entries of ``[prior]``, by parameter name; they may state the priors of ``parameters``.
+
+    Errors are appended to ``faults``. Where there are some, an experiment may be missing, and its spring with it.
+    """
     entries = root.get("prior", {}).table("[prior]")
     rows = {row.symbol: row for row in parameters if row.prior_can_be_stated}
     known = ["k2[<spring>]" if symbol == "k2" else symbol for symbol in sorted(rows, key=lambda s: rows[s].scatter)]
     springs = sorted({table.settings.spring for table in tables if getattr(table.settings, "spring", None)})
-    priors = {}
+    priors, whole = dict[str, Prior](), not faults
     for key in entries.value:
         node, spring = entries[key], re.fullmatch(rf"k2\[({NAME_PATTERN})\]", key)
-        if spring and spring[1] not in springs:
-            raise node.error(
-                "a prior of k2 must name a spring of an experiment",
-                spring[1],
-                f"write {' or '.join(f'k2[{name}]' for name in springs)}" if springs else "remove it",
-                of_key=True,
-            )
-        if not spring:
-            replace(entries, value={key: node.value}).refuse_unknown(known)
-        row = rows["k2" if spring else key]
-        assert row.prior is not None, "its prior can be stated"
-        priors[key] = node.prior(row.unit, row.prior)
+        with collecting(faults):
+            if spring and spring[1] not in springs and whole:
+                raise node.error(
+                    "a prior of k2 must name a spring of an experiment",
+                    spring[1],
+                    f"write {' or '.join(f'k2[{name}]' for name in springs)}" if springs else "remove it",
+                    of_key=True,
+                )
+            if not spring:
+                replace(entries, value={key: node.value}).refuse_unknown(known)
+            row = rows["k2" if spring else key]
+            assert row.prior is not None, "its prior can be stated"
+            priors[key] = node.prior(row.unit, row.prior)
     return priors
 
 
 def _read_experiments(
     root: Node, kinds: Mapping[str, KindRule], ground: Mapping[str, Quantity], faults: list[InputError]
 ) -> tuple[tuple[Table, ...], dict[str, str]]:
-    """Every ``[[experiment]]``, and the sha256 of every file read; the first error of each is appended to ``faults``."""
+    """Every ``[[experiment]]``, and the sha256 of every file read; errors are appended to ``faults``."""
     entries = root.get("experiment", [])
     if not isinstance(entries.value, list) or not entries.value:
-        raise entries.error(
+        rule, remedy = (
             "a rig must have at least one [[experiment]]",
-            shown(entries.value),
             'add [[experiment]] with kind = "..." and file = "..."',
         )
+        raise_all([*faults, entries.error(rule, shown(entries.value), remedy)])
     tables: list[Table] = []
     files: dict[str, str] = {}
     for index, label in enumerate(_default_labels(entries.value)):
@@ -231,13 +248,20 @@ def _read_experiment(
     kind = kinds[word]
     rules, errors = kind.setting_rules, [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
     entry.refuse_unknown(("kind", "file", "label", "reject", "clock", *MAP_KEYS, *rules, *errors), TABLE_KEYS)
-    stated = read_rules(entry, rules)
-    for key in kind.required:
-        if key not in stated:
-            raise entry.error(f"{kind.name} must have a {key}", "none", f"add {key} = ...")
-    settings = kind.settings(**{**{key: value for key, value in ground.items() if key in rules}, **stated})
-    label = entry["label"].name() if "label" in entry else label
-    read, sha256 = read_tables(entry, kind, label, settings)
+    faults, stated = list[InputError](), dict[str, Any]()
+    with collecting(faults):
+        stated = read_rules(entry, {**rules, "label": NameRule()})
+    faults += [
+        entry.error(f"{kind.name} must have a {key}", "none", f"add {key} = ...")
+        for key in kind.required
+        if key not in entry
+    ]
+    label, settings = stated.pop("label", label), Settings()
+    if not faults:
+        settings = kind.settings(**{**{key: value for key, value in ground.items() if key in rules}, **stated})
+    with collecting(faults):
+        read, sha256 = read_tables(entry, kind, label, settings)
+    raise_all(faults)
     tables = list[Table]()
     for table, raw in read:
         for key in errors:

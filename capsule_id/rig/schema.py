@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import (
     Annotated,
     Any,
+    ClassVar,
     Generic,
     Literal,
     Protocol,
@@ -17,11 +18,23 @@ from typing import (
     runtime_checkable,
 )
 
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.model import SHORTEST_RECORD, ModelChoices, Quantity, S, Settings, Table
-from capsule_id.rig.toml import ANY, INCLINE, POSITIVE, Domain, Node, is_count, remedy_for, shown
+from capsule_id.rig.toml import (
+    ANY,
+    ERRORS,
+    INCLINE,
+    NAME_PATTERN,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Domain,
+    Node,
+    is_count,
+    remedy_for,
+    shown,
+)
 from capsule_id.views import counted
 
 # schema: Types for the columns, settings and rules of a kind of experiment. The reader uses no other type of a kind.
@@ -41,9 +54,24 @@ class ColumnRule:
     usual: tuple[float, float] | None = None
 
 
+def table_schema(keys: Mapping[str, Any], required: Iterable[str] = ()) -> dict[str, Any]:
+    """The JSON schema of a table with these ``keys``, rules of settings or schemas; a rule without one allows any value."""
+    forms = {key: form if isinstance(form, dict) else getattr(form, "schema", {}) for key, form in keys.items()}
+    return {"type": "object", "properties": forms, "required": [*required], "additionalProperties": False}
+
+
+def number_schema(domain: Domain) -> dict[str, Any]:
+    """The JSON schema of a number whose ``domain`` has a lower end of 0, in any unit, or no lower end."""
+    end = "minimum" if domain.closed else "exclusiveMinimum"
+    return {"type": "number", **({end: domain.low} if domain.low >= 0.0 else {})}
+
+
 @runtime_checkable
 class SettingRule(Protocol):
-    """Reads one setting. A kind may define its own rule: any object with this method."""
+    """Reads one setting. A kind may define its own rule: any object with this method.
+
+    Its JSON schema, for the help of editors, may stand in an attribute ``schema``.
+    """
 
     def read(self, node: Node) -> object:
         """The checked value of ``node``, as stored in the settings.
@@ -72,6 +100,16 @@ class QuantityRule:
         """See ``SettingRule``."""
         quantity = node.quantity(self.si, self.domain, self.has_sd)
         return quantity if self.has_sd else quantity.value
+
+    @property
+    def schema(self) -> dict[str, Any]:
+        """Its JSON schema."""
+        keys = {
+            "value": number_schema(self.domain),
+            **dict.fromkeys(ERRORS if self.has_sd else (), number_schema(NOT_NEGATIVE)),
+            "unit": {"type": "string", "description": f"{self.si}, or an equivalent unit"},
+        }
+        return table_schema(keys, ("value", "unit"))
 
 
 #: Slope of the track and force that presses the capsule down.
@@ -103,14 +141,20 @@ class ChoiceRule:
         """See ``SettingRule``."""
         return node.choice(self.choices)
 
+    @property
+    def schema(self) -> dict[str, Any]:
+        """Its JSON schema."""
+        return {"enum": [*self.choices]}
+
 
 @dataclass(frozen=True)
 class PlainRule:
-    """A value of TOML as it is. ``rule`` continues "<key> must ..."."""
+    """A value of TOML as it is. ``rule`` continues "<key> must ..."; ``schema``: its JSON schema."""
 
     holds: Callable[[Any], bool]
     rule: str
     remedy: str
+    schema: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def read(self, node: Node) -> Any:
         """See ``SettingRule``."""
@@ -132,10 +176,22 @@ class WordsRule:
         # Words of a list have no place of their own.
         return tuple(replace(node, value=word).choice(self.choices) for word in node.value)
 
+    @property
+    def schema(self) -> dict[str, Any]:
+        """Its JSON schema."""
+        word = {"enum": [*self.choices]}
+        return {"anyOf": [word, {"type": "array", "items": word, "minItems": 1}]}
+
+
+#: JSON schema of a whole number, 1 or more.
+WHOLE = {"type": "integer", "minimum": 1}
+
 
 @dataclass(frozen=True)
 class NameRule:
     """A name of letters, digits, dot, underscore, hyphen."""
+
+    schema: ClassVar = {"type": "string", "pattern": f"^{NAME_PATTERN}$"}
 
     def read(self, node: Node) -> str:
         """See ``SettingRule``."""
@@ -143,7 +199,7 @@ class NameRule:
 
 
 #: A whole number, 1 or more.
-COUNT = PlainRule(is_count, "be a whole number, 1 or more", "write e.g. 10")
+COUNT = PlainRule(is_count, "be a whole number, 1 or more", "write e.g. 10", WHOLE)
 
 
 @dataclass(frozen=True)
@@ -291,9 +347,15 @@ def read_rules(node: Node, rules: Mapping[str, SettingRule]) -> dict[str, Any]:
     Raises
     ------
     InputError
-        At the first value, in the order of the rules, that breaks its rule.
+        At every value that breaks its rule, in the order of the rules.
     """
-    return {key: rule.read(node[key]) for key, rule in rules.items() if key in node}
+    values, faults = dict[str, Any](), list[InputError]()
+    for key, rule in rules.items():
+        if key in node:
+            with collecting(faults):
+                values[key] = rule.read(node[key])
+    raise_all(faults)
+    return values
 
 
 def parameter_rows(kinds: Mapping[str, KindRule]) -> dict[str, Parameter]:
@@ -320,6 +382,16 @@ RIG_QUANTITIES: Mapping[str, QuantityRule] = {
     "slope": SLOPE,
     "N0": PRESSING_FORCE,
 }
+#: Its other keys but ``confirmed``.
+RIG_WORDS: Mapping[str, SettingRule] = {
+    "name": NameRule(),
+    "synthetic": PlainRule(
+        lambda value: isinstance(value, bool),
+        "be true or false",
+        "write true or false without quotes",
+        {"type": "boolean"},
+    ),
+}
 #: Keys of the tables of rig.toml that stand once.
 TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
     "[rig]": ("name", "synthetic", "confirmed", *RIG_QUANTITIES),
@@ -333,6 +405,10 @@ INSTRUMENT_KEYS = ("name", "gain", "offset", "clock")
 # other.
 
 
+#: Choices of ``[model]``.
+MODEL_RULES: Mapping[str, ChoiceRule] = {
+    key: ChoiceRule(get_args(get_type_hints(ModelChoices)[key])) for key in ("friction", "reaction", "engine")
+}
 #: Words that ``free`` may hold.
 OPTIONAL = tuple(symbol for symbol, row in TABLE.items() if row.optional)
 
@@ -365,23 +441,20 @@ def read_model(root: Node) -> ModelChoices:
     """
     head = root.get("model", {}).table("[model]")
     head.refuse_unknown(TABLE_KEYS["[model]"], TABLE_KEYS)
-    choices: dict[str, str] = {}
-    for key in ("friction", "reaction", "engine"):
-        words = get_args(get_type_hints(ModelChoices)[key])
-        choices[key] = head.get(key, words[0]).choice(words)
+    choices = read_rules(head, MODEL_RULES)
     node = head.get("free", [])
     node.require(isinstance(node.value, list), "be a list of words", f'write free = ["{OPTIONAL[0]}"]')
     free = read_words(node, OPTIONAL, "optional parameters", f"write some of {' '.join(OPTIONAL)}")
     if twice := [word for index, word in enumerate(free) if word in free[:index]]:
         raise node.error("free must name each parameter once", shown(twice[0]), "remove the second one")
-    if choices["friction"] == "constant" and "ratio" in free:
+    if choices.get("friction") == "constant" and "ratio" in free:
         raise node.error(
             "constant friction has no ratio",
             shown("ratio"),
             'remove "ratio" from free, or remove friction = "constant"',
         )
     in_order = tuple(symbol for symbol in OPTIONAL if symbol in free)
-    return ModelChoices(free=in_order, **choices)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    return ModelChoices(free=in_order, **choices)
 
 
 def check_engine(root: Node, model: ModelChoices, tables: Sequence[Table[Any]]) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, raise_all
 from capsule_id.parameters import Prior
 from capsule_id.rig.model import ROUNDING, Quantity
 from capsule_id.rig.units import UnitError, factor_to_si, scale
@@ -352,12 +352,16 @@ class Node:
         return self[key]
 
     def refuse_unknown(self, known: Collection[str], elsewhere: Mapping[str, Collection[str]] | None = None) -> None:
-        """Raise at the first key of a table that is not ``known``; ``elsewhere``: keys of other tables, by table."""
+        """Raise at the keys of a table that are not ``known``; ``elsewhere``: keys of other tables, by table."""
+        faults: list[InputError] = []
         for key in self.value:
             if key not in known:
                 table = next((name for name, keys in (elsewhere or {}).items() if key in keys), None)
                 remedy = f"move it to {table}" if table else remedy_for(key, known, "remove it", "write {}")
-                raise self[key].error("unknown key", shown(key), f"{remedy}; known: {' '.join(known)}", of_key=True)
+                faults.append(
+                    self[key].error("unknown key", shown(key), f"{remedy}; known: {' '.join(known)}", of_key=True)
+                )
+        raise_all(faults)
 
     def table(self, example: str, known: Collection[str] = ()) -> "Node":
         """The value itself, a table with keys that are ``known``; (): they are not checked."""

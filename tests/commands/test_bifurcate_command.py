@@ -19,7 +19,7 @@ from capsule_id.motions import sweep
 from capsule_id.motions.response import Settling, response
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.report.figures.sweeps import MeasuredPoint
-from tests.cli_tools import ROOT, listing, small_rig
+from tests.cli_tools import ROOT, listing, message, small_rig
 
 SHORT = ["--dropped", "20", "--observed", "6", "--quiet"]
 OVER = ["--over", "k2", "--from", "5", "--to", "50", "--unit", "kN/m", "--points", "4"]
@@ -182,11 +182,13 @@ def test_measured_runs_are_laid_over_the_diagram() -> None:
         (["nowhere", *OVER], "nowhere"),
     ],
 )
-def test_errors_are_one_line_and_write_nothing(words: list[str], rule: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_are_one_message_and_write_nothing(
+    words: list[str], rule: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert _run(*words, "--quiet") == 2
     said = capsys.readouterr()
-    assert rule in said.err
-    assert (said.err.count("\n"), said.out) == (1, "")
+    assert rule in message(said.err)
+    assert (message(said.err).count("\n"), said.out) == (1, "")
     assert listing(Path()) == {}
 
 
@@ -197,7 +199,7 @@ def test_what_is_not_ours_stays(capsys: pytest.CaptureFixture[str]) -> None:
     before = listing(Path())
     assert _run(*OVER, *MAP, *SHORT, "--out", "a.nc") == 2
     assert _run(*OVER, *SHORT, "--out", "b.nc") == 2
-    assert capsys.readouterr().err.count("\n") == 2
+    assert message(capsys.readouterr().err).count("\n") == 2
     assert listing(Path()) == before
 
 

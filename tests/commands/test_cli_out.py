@@ -21,7 +21,7 @@ from capsule_id.cli import fit_params
 from capsule_id.errors import InputError, OutputError
 from capsule_id.output import CHAINS, LOCK, STATE, check_directory, publish, replace_file, work_in_progress
 from capsule_id.report.write import write_result
-from tests.cli_tools import Killed, argv, environment, failing, listing, run, small_rig
+from tests.cli_tools import Killed, argv, environment, failing, listing, message, run, small_rig
 
 RESULT = {"parameters.json", "parameters.csv", "report.html", "figures"}
 
@@ -90,7 +90,7 @@ def test_directories_that_are_refused(here: Path, capsys: pytest.CaptureFixture[
     ):
         assert fit_params(["rig", "--no-sample", "--out", out]) == 2
         stdout, stderr = capsys.readouterr()
-        assert (stdout, stderr.count("\n")) == ("", 1)
+        assert (stdout, message(stderr).count("\n")) == ("", 1)
         assert named in stderr.lower()
         assert listing(here) == before
 

@@ -17,15 +17,16 @@ import pytest
 from capsule_id import cli, console
 from capsule_id.cli import capsule_id, fit_params
 from capsule_id.views import Level, Trust
-from tests.cli_tools import DATA, argv, environment, listing, parsers, run, small_rig
+from tests.cli_tools import DATA, argv, environment, listing, message, parsers, run, small_rig
 
 HEAVY = ("jax", "matplotlib", "pandas", "emcee", "equinox", "optimistix", "xarray")
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str, program: str = "fit_params") -> str:
-    """The one line with which a command refuses ``words``."""
+    """The one message with which a command refuses ``words``."""
     code = {"fit_params": fit_params, "capsule_id": capsule_id}[program](words)
     out, err = capsys.readouterr()
+    err = message(err)
     assert (code, out, err.count("\n")) == (2, "", 1), err
     return err
 
@@ -49,6 +50,15 @@ def test_help_is_quick_and_light(tmp_path: Path, name: str, words: tuple[str, ..
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_check_of_bench_tests_loads_what_it_needs(tmp_path: Path) -> None:
+    """No pandas, no figures, no sampler: they take as long as the check itself."""
+    report = "import atexit, sys\natexit.register(lambda: print('loaded', *sys.modules, file=sys.stderr))\n"
+    rig = small_rig(tmp_path / "rig", tables=("static_friction", "motor_current"))
+    done = run("check", str(rig), cwd=tmp_path, name="capsule_id", before=report)
+    assert done.returncode == 0
+    assert not set(done.stderr.split()) & set(HEAVY) - {"jax", "equinox"}
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [
@@ -70,7 +80,7 @@ def test_help_is_quick_and_light(tmp_path: Path, name: str, words: tuple[str, ..
         ((str(DATA), "two\nlines"), "two lines"),
     ],
 )
-def test_wrong_usage_is_one_line(capsys: pytest.CaptureFixture[str], words: tuple[str, ...], named: str) -> None:
+def test_wrong_usage_is_one_message(capsys: pytest.CaptureFixture[str], words: tuple[str, ...], named: str) -> None:
     assert named in refused(capsys, *words)
 
 

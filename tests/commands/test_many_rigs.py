@@ -13,7 +13,7 @@ import pytest
 from capsule_id.cli import fit_params
 from capsule_id.commands import rigs as many_rigs
 from capsule_id.commands.bifurcate import client_of
-from tests.cli_tools import listing, small_rig
+from tests.cli_tools import listing, message, small_rig
 
 TABLES = {"tilts": ("static_friction",), "spring": ("support_spring_soft",)}
 
@@ -86,7 +86,7 @@ def test_bad_input_is_named_and_nothing_is_written(
     (here / "tilts" / "spring" / "mine.txt").write_text("kept")
     before = listing(here)
     assert fit_params([*words, "--no-sample", "--quiet"] if "--compare" not in words else [*words]) == 2
-    assert named in capsys.readouterr().err
+    assert named in message(capsys.readouterr().err)
     assert listing(here) == before
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capsule_id.cli import capsule_id, fit_params
-from tests.cli_tools import DATA, ROOT, environment, run, small_rig
+from tests.cli_tools import DATA, ROOT, environment, message, run, small_rig
 
 CORPUS = ROOT.parent / "shared" / "corpus"
 #: A workbook that names two thousand million rows: it is read for more than 400 s, which no line of a library explains.
@@ -54,7 +54,7 @@ def test_fits_of_tables_in_coarse_steps(
     folder = in_steps(small_rig(tmp_path / "rig", tables=(table,)), table, column, steps)
     out = str(tmp_path / "out")
     code = fit_params([str(folder), "--no-sample", "--quiet", "--out", out])
-    lines = capfd.readouterr().err.splitlines()
+    lines = message(capfd.readouterr().err).splitlines()
     assert (code, len(lines)) in ((0, 0), (3, 1), (2, 1)), lines
     assert all(line.startswith(("fit-params: verdict not clean: ", str(folder))) for line in lines)
 
@@ -93,4 +93,4 @@ def test_no_line_of_a_library_leaves_a_command(tmp_path: Path, name: str) -> Non
     ):
         assert done.returncode in (0, 2, 3), done.stderr
         allowed = (f"{command}: verdict not clean: ", str(CORPUS / name))
-        assert [line for line in done.stderr.splitlines() if not line.startswith(allowed)] == []
+        assert [line for line in message(done.stderr).splitlines() if not line.startswith(allowed)] == []

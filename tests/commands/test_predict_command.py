@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from capsule_id.cli import capsule_id
+from tests.cli_tools import message
 
 
 @pytest.mark.parametrize(
@@ -26,7 +27,7 @@ def test_wrong_input_is_named(
         ["predict", str(tmp_path / "none"), str(settings), "--out", str(out), "--seed", seed, "--no-cache"]
     )
     assert code == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = message(capsys.readouterr().err).splitlines()
     assert words in line
     assert out.exists() == taken
 
@@ -36,7 +37,7 @@ def test_a_figure_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtu
     figure.write_text("kept")
     asked = ["predict", str(tmp_path), str(tmp_path / "settings.csv"), "--out", str(out), "--figure", str(figure)]
     assert capsule_id(asked) == 2
-    assert "--figure must name a new file, it exists, choose another name" in capsys.readouterr().err
+    assert "--figure must name a new file, it exists, choose another name" in message(capsys.readouterr().err)
     assert not out.exists()
     assert figure.read_text() == "kept"
 
@@ -56,7 +57,7 @@ def test_a_figure_that_cannot_be_is_named_first(
     out = tmp_path / "predicted.png"
     asked = ["predict", str(tmp_path), str(tmp_path / "s.csv"), "--out", str(out), "--figure", str(tmp_path / figure)]
     assert capsule_id(asked) == 2
-    assert words in capsys.readouterr().err
+    assert words in message(capsys.readouterr().err)
     assert not out.exists()
 
 

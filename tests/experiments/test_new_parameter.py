@@ -105,4 +105,4 @@ def test_without_the_three_places_it_is_unknown(rig: Path, tmp_path: Path) -> No
     """The negative control."""
     done = cli_tools.run("check", str(rig), cwd=tmp_path, name="capsule_id")
     assert done.returncode == 2
-    assert "free must name optional parameters, 'rise'" in done.stderr
+    assert "free must name optional parameters, 'rise'" in cli_tools.message(done.stderr)

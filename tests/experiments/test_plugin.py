@@ -110,7 +110,7 @@ def test_without_the_package_the_kind_is_unknown(folder: Path, tmp_path: Path) -
     """The negative control."""
     done = cli_tools.run("check", str(folder), name="capsule_id", cwd=tmp_path)
     assert done.returncode == 2
-    assert "unknown kind, 'rolling_resistance'" in done.stderr
+    assert "unknown kind, 'rolling_resistance'" in cli_tools.message(done.stderr)
 
 
 @pytest.mark.full

@@ -10,6 +10,7 @@ import pytest
 import capsule_id
 from capsule_id import cli
 from capsule_id.rig.guess import name_and_unit
+from tests.cli_tools import message
 from tests.importing.spoiled_exports import Spoiled, spoiled_exports
 from tests.measured.sources import measured_file
 
@@ -129,7 +130,7 @@ def test_files_that_cannot_be_read_are_refused_and_nothing_is_written(
     for name, part in (("words.csv", "rows of numbers"), ("photo.png", "known format"), ("none.csv", "no such file")):
         for words in (["import"], ["init", str(tmp_path / "rig"), "--from"]):
             assert cli.capsule_id([*words, str(tmp_path / name)]) == 2
-            err = capsys.readouterr().err
+            err = message(capsys.readouterr().err)
             assert part in err
             assert err.count("\n") == 1
     assert not (tmp_path / "rig").exists()
@@ -199,7 +200,7 @@ def test_times_that_do_not_increase_are_named(tmp_path: Path, capsys: pytest.Cap
 def test_an_export_of_one_row_is_refused_with_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "one.csv").write_text("time [s],x_rel [mm]\n0,2.5\n", encoding="utf-8")
     assert cli.capsule_id(["import", str(tmp_path / "one.csv")]) == 2
-    assert "one.csv:2: an export must have two rows of numbers or more, one row" in capsys.readouterr().err
+    assert "one.csv:2: an export must have two rows of numbers or more, one row" in message(capsys.readouterr().err)
     assert cli.capsule_id(["import", str(tmp_path)]) == 2
     assert "a directory" in capsys.readouterr().err
 

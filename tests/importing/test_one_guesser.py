@@ -9,6 +9,7 @@ import pytest
 import capsule_id
 from capsule_id import cli
 from capsule_id.rig.model import Rig
+from tests.cli_tools import message
 
 MASSES = '[rig]\nname = "a"\nm1 = { value = 0.1, unit = "kg" }\nm2 = { value = 0.5, unit = "kg" }\n'
 
@@ -124,7 +125,7 @@ def test_a_file_without_a_column_of_numbers_is_refused_and_headers_command_no_te
     """Before: StopIteration, and an escape code as it stood in the file."""
     (tmp_path / "a.csv").write_text("angle [deg]\n30\n31\n1e400\n32\n", encoding="utf-8")
     assert cli.capsule_id(["import", str(tmp_path / "a.csv")]) == 2
-    assert "a.csv:4:1: a cell must be a finite number" in capsys.readouterr().err
+    assert "a.csv:4:1: a cell must be a finite number" in message(capsys.readouterr().err)
     rows = "".join(f"{0.01 * k:.2f},{k % 5}.5\n" for k in range(60))
     (tmp_path / "a.csv").write_text(f"\x1b[31mT (s),x\x07\x1b]0;evil\x07 (mm)\n{rows}", encoding="utf-8")
     assert cli.capsule_id(["import", str(tmp_path / "a.csv")]) == 0

@@ -10,6 +10,7 @@ import pytest
 from capsule_id import cli
 from capsule_id.api import read_rig
 from capsule_id.experiments.kind import default_registry
+from tests.cli_tools import message
 from tests.rig.formats.writers import Columns, csv_gz, hdf5, lvm, mat_5, npz, parquet_file, tdms, text_rows, txt, xlsx
 
 DATA = Path(__file__).parents[2] / "data"
@@ -112,7 +113,6 @@ def test_an_unfilled_unit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert cli.capsule_id(["init", str(tmp_path / "rig"), "--from", str(tmp_path / "a.mat")]) == 0
     capsys.readouterr()
     assert cli.capsule_id(["check", str(tmp_path / "rig")]) == 2
-    assert (
-        "state the unit of the column, which the file does not say, '?', write a unit such as N"
-        in capsys.readouterr().err
+    assert "state the unit of the column, which the file does not say, '?', write a unit such as N" in message(
+        capsys.readouterr().err
     )

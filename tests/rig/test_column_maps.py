@@ -13,6 +13,7 @@ from capsule_id.errors import FolderError, InputError
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
 from capsule_id.rig.model import Rig
+from tests.cli_tools import message
 from tests.rig.faults import MARK, assert_fault, place_of
 
 TIME = np.arange(12) * 0.01
@@ -318,7 +319,7 @@ def test_one_call_prints_the_first_error_of_each_experiment(tmp_path: Path, caps
     out = tmp_path / "out"
     for command, words in ((cli.capsule_id, ["check"]), (cli.fit_params, ["--out", str(out)])):
         assert command([*words, str(tmp_path)]) == 2
-        lines = capsys.readouterr().err.strip().split("\n")
+        lines = message(capsys.readouterr().err).strip().split("\n")
         assert (len(lines), lines[-1]) == (21, "23 errors")
         assert all(str(tmp_path / "rig.toml") in line for line in lines[:-1])
     assert not out.exists()

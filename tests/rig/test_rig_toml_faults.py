@@ -53,7 +53,7 @@ TOML_FAULTS = [
     ("factor = 3,", "factor = ‸1,", "factor of k1 must be greater than 1"),
     ("k1 = { median = 1.5, factor = 3,", "k1 = ‸{ median = 1.5,", "k1 must have a factor"),
     ("k1 = { median", "k1 = { ‸scale", "unknown key, 'scale'"),
-    ("k1 = { median = 1.5, factor = 3", "k1 = { ‸value = 1.5, sd = 3", "unknown key, 'value'"),
+    ("k1 = { median = 1.5", "k1 = { ‸value = 1.5", "unknown key, 'value'"),
     ("scale = 1,", "scale = ‸0,", "scale of tilt_sd must be greater than 0"),
     ("push_scatter = { scale", "push_scatter = { ‸median", "unknown key, 'median'"),
     ("push_scatter = { scale = 0.05", 'push_scatter = { scale = 0.05, unit = ‸"deg"', "unit must be 1 (a pure number)"),
