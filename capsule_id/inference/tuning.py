@@ -169,17 +169,14 @@ def tune(
         rule = "a setting needs a motion that can be computed for every draw"
         raise InputError(rule, f"none of {computed} settings", "search a smaller range")
     best = {name: float(x[np.argmax(goal)]) for name, x in finalists.items()}
+    place = {name: (best[name] - low) / (high - low) for name, (low, high) in bounds.items()}
     return Tuning(
         best,
         _table(model, best, operating_points(result, chosen, drive), faster_than, result.trust),
         _other_motions(model, best, seed),
         _sensitivity(model, best, bounds),
         surface,
-        tuple(
-            name
-            for name, ends in bounds.items()
-            if np.min(np.abs(np.subtract(best[name], ends)) / np.ptp(ends)) < AT_END
-        ),
+        tuple(name for name, x in place.items() if not AT_END < x < 1.0 - AT_END),
         computed,
         failed,
     )
