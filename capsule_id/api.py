@@ -32,6 +32,7 @@ from capsule_id.inference.pipeline import (
 )
 from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.prediction import DRAWS, predict, random_draws
+from capsule_id.inference.profiles import check_profiled
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
@@ -504,14 +505,11 @@ def fit(
         readings = check_readings(rig, experiments, kinds)
         made, second = second_models(make_experiments(rig, experiments, kinds, friction, contact), readings)
         target = LogPosterior(rig, made)
-        if unknown := [name for name in profile if name not in target.names]:
-            known = ", ".join(target.names)
-            raise InputError("a profile needs a parameter of the fit", unknown[0], f"choose from {known}")
+        check_profiled(target, profile)
         point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
         before = (*readings, *second)
         if preliminary is not None and budget is not None:
-            first = unfinished(point, before)
-            preliminary(make_result(first, kinds, seeds.report, made_from, Fit, panels=False))
+            preliminary(make_result(unfinished(point, before), kinds, seeds.report, made_from, Fit, panels=False))
         checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, show, ess), before)
         return make_result(checked, kinds, seeds.report, made_from, Fit, profiled=profile)
 

@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 from capsule_id import console
 from capsule_id.commands import add_options
@@ -62,7 +62,8 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _capsule_parser(program: str) -> argparse.ArgumentParser:
+def _commands() -> tuple[tuple[str, Any, str, str], ...]:
+    """Name, module, help and example of each command."""
     from capsule_id.commands import (
         bifurcate,
         check,
@@ -76,11 +77,7 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
         tune,
     )
 
-    parser = _parser(program, "Make, check, fit, simulate and report.")
-    parser.epilog = "example: %(prog)s check my-rig; each COMMAND has its own --help"
-    parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)
-    commands = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
-    for name, module, text, example in (
+    return (
         (
             "init",
             init,
@@ -121,7 +118,15 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
             "the parameter table and findings of a result, or several side by side",
             "results/rig-a results/rig-b",
         ),
-    ):
+    )
+
+
+def _capsule_parser(program: str) -> argparse.ArgumentParser:
+    parser = _parser(program, "Make, check, fit, simulate and report.")
+    parser.epilog = "example: %(prog)s check my-rig; each COMMAND has its own --help"
+    parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)
+    commands = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
+    for name, module, text, example in _commands():
         sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
         sub.epilog = f"example: %(prog)s {example}"
         add_options(sub, module.OPTIONS)

@@ -44,9 +44,15 @@ def profile(target: LogPosterior, fit: PointFit, name: str, values: int = VALUES
     InputError
         If the parameter is not sampled.
     """
-    if name not in target.names:
-        raise InputError("a profile needs a sampled parameter", name, f"choose from {', '.join(target.names)}")
+    check_profiled(target, [name])
     return _profiles(target, fit, [name], values)[name]
+
+
+def check_profiled(target: LogPosterior, names: Sequence[str]) -> None:
+    """Refuse names of parameters that are not sampled."""
+    for name in names:
+        if name not in target.names:
+            raise InputError("a profile needs a parameter of the fit", name, f"choose from {', '.join(target.names)}")
 
 
 def _profiles(target: LogPosterior, fit: PointFit, names: Sequence[str], values: int) -> dict[str, pd.DataFrame]:

@@ -157,7 +157,35 @@ def tune(
     drive = "pulses" if {*bounds, *given} & ({*DRIVES["pulses"]} - {*DRIVES["harmonic"]}) else "harmonic"
     _check_search(result, bounds, given, drive, faster_than)
     model = _Model(_leaves(result, chosen, drive, {*bounds}, given, spring), drive, draws)
-    ends = np.array(list(bounds.values()), float)
+    found, computed, failed = _search(model, bounds, faster_than, seed, progress)
+    surface = _surface(model, bounds, dict(zip(bounds, found[0], strict=True)))
+    # The best point of the map may stand on a summit that the search has missed.
+    highest = surface["mean_velocity"].fillna(-np.inf).argmax(...)
+    on_map = {name: float(surface[name][int(at)]) for name, at in highest.items()}
+    last = np.array([on_map.get(str(name), x) for name, x in zip(bounds, found[0], strict=True)])
+    finalists = dict(zip(bounds, np.vstack([found, last]).T, strict=True))
+    goal = score(model.velocity(finalists, FINAL), faster_than)
+    if not np.isfinite(goal).any():
+        rule = "a setting needs a motion that can be computed for every draw"
+        raise InputError(rule, f"none of {computed} settings", "search a smaller range")
+    best = {name: float(x[np.argmax(goal)]) for name, x in finalists.items()}
+    place = {name: (best[name] - low) / (high - low) for name, (low, high) in bounds.items()}
+    return Tuning(
+        best,
+        _table(model, best, operating_points(result, chosen, drive), faster_than, result.trust),
+        _other_motions(model, best, seed),
+        _sensitivity(model, best, bounds),
+        surface,
+        tuple(name for name, x in place.items() if not AT_END < x < 1.0 - AT_END),
+        computed,
+        failed,
+    )
+
+
+def _search(
+    model: _Model, bounds: Values, faster_than: float | None, seed: int, progress: OnProgress | None
+) -> tuple[np.ndarray, int, int]:
+    """The best members of the last generation (FINALISTS, d), the best first; numbers of computed and failed settings."""
     computed = failed = 0
 
     def cost(x: np.ndarray) -> np.ndarray:
@@ -169,31 +197,9 @@ def tune(
             progress(computed, (1 + GENERATIONS) * len(goal), "settings")
         return -goal
 
-    search: dict[str, Any] = {"init": "sobol", "popsize": MEMBERS, "maxiter": GENERATIONS, "polish": False, "rng": seed}
-    found: Any = differential_evolution(cost, ends, vectorized=True, updating="deferred", **search)
-    order = np.argsort(found.population_energies)[:FINALISTS]
-    surface = _surface(model, bounds, dict(zip(bounds, found.x, strict=True)))
-    # The best point of the map may stand on a summit that the search has missed.
-    highest = surface["mean_velocity"].fillna(-np.inf).argmax(...)
-    on_map = {name: float(surface[name][int(at)]) for name, at in highest.items()}
-    last = np.array([on_map.get(str(name), x) for name, x in zip(bounds, found.x, strict=True)])
-    finalists = dict(zip(bounds, np.vstack([found.population[order], last]).T, strict=True))
-    goal = score(model.velocity(finalists, FINAL), faster_than)
-    if not np.isfinite(goal).any():
-        rule = "a setting needs a motion that can be computed for every draw"
-        raise InputError(rule, f"none of {computed} settings", "search a smaller range")
-    best = {name: float(x[np.argmax(goal)]) for name, x in finalists.items()}
-    near = np.min(np.abs(np.array(list(best.values()))[:, None] - ends) / np.diff(ends), axis=1) < AT_END
-    return Tuning(
-        best,
-        _table(model, best, operating_points(result, chosen, drive), faster_than, result.trust),
-        _other_motions(model, best, seed),
-        _sensitivity(model, best, bounds),
-        surface,
-        tuple(name for name, at in zip(bounds, near, strict=True) if at),
-        computed,
-        failed,
-    )
+    words: dict[str, Any] = {"init": "sobol", "popsize": MEMBERS, "maxiter": GENERATIONS, "polish": False, "rng": seed}
+    found: Any = differential_evolution(cost, list(bounds.values()), vectorized=True, updating="deferred", **words)
+    return found.population[np.argsort(found.population_energies)[:FINALISTS]], computed, failed
 
 
 def _check_search(result: Result, bounds: Values, given: Values, drive: str, faster_than: float | None) -> None:

@@ -75,7 +75,7 @@ def test_a_profile_is_the_ridge_of_a_grid(tmp_path: Path) -> None:
     (table,) = profile_tables(target, fit, ["mu", "mu"])
     low, high = float(table.facts["lower"]), float(table.facts["upper"])
     np.testing.assert_allclose(np.interp(np.log([low, high]), u, found["profile"]), -DROP, atol=0.05)
-    with pytest.raises(InputError, match="a profile needs a sampled parameter, k9, choose from mu"):
+    with pytest.raises(InputError, match="a profile needs a parameter of the fit, k9, choose from mu"):
         profile(target, fit, "k9")
 
 

@@ -324,33 +324,30 @@ def tuned(
     best : the chosen settings by symbol, SI
     measured : label, settings by symbol (SI) and mean velocity (mm/s) of measured operating points
     """
-    figure = new_figure(7.4, 5.0, right=0.5)
+    figure = new_figure(7.4, 5.0, right=0.5, top=0.62)
     ax, shown = figure.subplots(), list(map(str, data["mean_velocity"].dims))
     if len(shown) == 2:
         quantity(data, "mean_velocity", ax)
-        title = f"{title} {_WORDS['mean_velocity']}".strip()
     else:
         low, _, high = MM * data["mean_velocity_quantiles"].to_numpy()
         ax.fill_between(data[shown[0]], low, high, color=PALE_BLUE, lw=0, label="95 % of the draws")
         ax.plot(data[shown[0]], MM * data["mean_velocity"], color=BLUE, lw=1.5, label="mean of the draws")
         ax.axvline(best[shown[0]], color=BLACK, lw=1.0, ls="--", label="chosen")
-    set_text(
-        ax, _axis_label(data, shown[0]), _axis_label(data, shown[1]) if shown[1:] else _WORDS["mean_velocity"], title
-    )
+    words = f"{title} {_WORDS['mean_velocity']}".strip()
+    figure.text(0.01, 0.99, words, fontsize=SMALL, va="top", fontweight="bold", parse_math=False)
+    set_text(ax, _axis_label(data, shown[0]), _axis_label(data, shown[1]) if shown[1:] else _WORDS["mean_velocity"])
     ends = [(float(data[name].min()), float(data[name].max())) for name in shown]
     if len(shown) == 2:
         ax.plot(*(best[name] for name in shown), ls="none", marker="*", ms=15, mfc="white", mec=BLACK, label="chosen")
     first = True
-    for label, settings, speed in measured:
+    for _, settings, speed in measured:
         place = [settings[name] for name in shown if name in settings]
         if len(place) < len(shown) or not all(low <= x <= high for x, (low, high) in zip(place, ends, strict=True)):
             continue
         at = (place[0], place[1] if shown[1:] else speed)
         look: dict[str, Any] = {"ls": "none", "marker": "D", "ms": 6.0, "mfc": "none", "mew": 1.6, "color": _MEASURED}
         ax.plot(*at, label="measured, mm/s" if first else None, **look)
-        text = ax.annotate(
-            f"{label}: {speed:.3g}", at, xytext=(0, 8), textcoords="offset points", ha="center", parse_math=False
-        )
+        text = ax.annotate(f"{speed:.3g}", at, xytext=(0, 8), textcoords="offset points", ha="center", parse_math=False)
         text.set(fontsize=SMALL - 1.0, path_effects=[withStroke(linewidth=2.5, foreground="white")], color=_MEASURED)
         first = False
     set_legend(ax, "above")
