@@ -12,7 +12,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, default_registry
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples
-from capsule_id.records.release import find_free_decay
+from capsule_id.records.release import find_free_decay, find_releases
 from capsule_id.records.tones import estimate_clock, frequency_of
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats.layouts import delimiter_of
@@ -446,6 +446,9 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[s
             yield _commented(f'f = {{ value = "{UNKNOWN}", unit = "Hz" }}', "unsure", "state the set value")
         return
     if isinstance(kind.setting_rules.get("start"), QuantityRule) and (part := free_part(time, values)) is not None:
+        if "releases" in kind.setting_rules and (several := find_releases(time, values, channel == "x_rel")):
+            yield _commented('releases = "all"', "likely", f"{len(several)} releases, each of which is fitted")
+            return
         start, stop = part
         yield _commented(f'start = {{ value = {start:.6g}, unit = "s" }}', "likely", "the free decay begins here")
         if stop is not None:

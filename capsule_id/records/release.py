@@ -3,8 +3,10 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from capsule_id.records.tones import frequency_of, noise_level
 from capsule_id.rig.filters import PIECE, loudest_part
@@ -51,6 +53,12 @@ GROWTH = 1.15
 SMALLEST_PUSH, PUSHED = 0.05, 1.3
 #: Time constants after which a decay has died out.
 DIED_OUT = 4.0
+#: Between two releases of one record the motion is smaller than this fraction of both amplitudes, and no amplitude is
+#: counted below this fraction of the largest one. The first decay ends where its motion is this many times the smallest.
+BETWEEN, SMALLEST_RELEASE, ENDS = 0.3, 0.05, 1.25
+#: The last part of a pull, relative to the amplitude, where the search for its release begins; largest deflections of a rod
+#: at rest, in standard deviations of the noise.
+PULLED, RESTS = 0.7, 6.0
 
 Poles = tuple[float, float]
 
@@ -93,6 +101,60 @@ def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = F
     if len(time) < len(whole):
         time[[0, -1]] = whole[[0, -1]]
     return _find(*(np.asarray(a, float).tobytes() for a in (time, values)), displacement)
+
+
+def find_releases(time: np.ndarray, values: np.ndarray, displacement: bool = False) -> list[slice]:
+    """The rows of each free decay in a record of several releases, in order; [] where it has fewer than two.
+
+    The rest at the end of a decay, the next pull and its hold belong to none of them.
+
+    Parameters
+    ----------
+    time, values, displacement : as in ``find_free_decay``
+    """
+    last = find_free_decay(time, values, displacement)
+    if last is None:
+        return []
+    size, found = max(int(last.period / float(np.median(np.diff(time)))), 1), list[slice]()
+    end = len(time) if last.end is None else int(np.searchsorted(time, last.end))
+    # The largest deflection in the period behind each sample; the last decay ends around the rest position.
+    far = np.abs(values - np.mean(values[max(end - size, 0) : end]))
+    motion = maximum_filter1d(far, size, origin=-(size // 2), mode="nearest")
+    cuts = _lowest_between(motion, max(size // 8, 1))
+    for first, stop in pairwise([0, *cuts, len(time)] if cuts else []):
+        top = first + int(np.argmax(motion[first:stop]))
+        if stop < len(time):
+            least = float(np.min(motion[top:stop]))
+            low = top + int(np.argmax(motion[top:stop] <= ENDS * least))
+            # At rest the next pull is seen when it begins; in a swing it hides.
+            over = np.flatnonzero(motion[low:stop] > 2.0 * least)
+            resting = least < RESTS * noise_level(values[first:stop])
+            stop = low if not resting else low + int(over[0]) if len(over) else stop
+        for row in (first + int(np.argmax(far[first:stop] > PULLED * motion[top])), first):
+            decay = find_free_decay(time[row:stop], values[row:stop], displacement)
+            if decay is None:
+                continue
+            begin = int(np.searchsorted(time, decay.start))
+            last = stop if decay.end is None else min(stop, int(np.searchsorted(time, decay.end)))
+            if last - begin > size and np.ptp(values[begin : begin + size]) > motion[top]:  # a hold does not swing
+                found.append(slice(begin, last))
+                break
+    return found if len(found) > 1 else []
+
+
+def _lowest_between(motion: np.ndarray, step: int) -> list[int]:
+    """Rows of the smallest motion between two amplitudes, for which every ``step``-th row is looked at."""
+    level = np.log(np.maximum(motion[::step], SMALLEST_RELEASE * np.max(motion))).tolist()
+    top, low, cuts = level[0], 0, list[int]()
+    for i, here in enumerate(level):
+        if here - level[low] > -np.log(BETWEEN) < top - level[low]:
+            cuts.append(low * step)
+            top = here
+        if here >= top:
+            top, low = here, i
+        elif here <= level[low]:  # the last one: the motion after it is the next pull
+            low = i
+    return cuts
 
 
 @lru_cache(maxsize=8)

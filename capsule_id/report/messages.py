@@ -239,6 +239,10 @@ DATA_MESSAGES: Mapping[str, Message] = {
         "several records",
         ok="{file}: the clock starts anew at lines {lines}. The {records} records are fitted as so many experiments.",
     ),
+    "times.parts": Message(
+        "several releases",
+        ok="{file}: cut at its releases. The decays fitted, {records}: {used}. Left out: {left}.",
+    ),
     "times.copies": Message(
         "repeated rows",
         warn="{file}:{line}: {rows:# row} repeat the row before, time and readings. The fit drops them. Check the export.",

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path, PureWindowsPath
 from types import MappingProxyType
 from typing import Any
@@ -400,6 +401,7 @@ def _records(
     nodes, tables = _file_nodes(entry), []
     increasing = "time" in raw.names and "time" in kind.columns and plateaus is None and len(nodes) == 1
     records = records_of(raw, nodes[0].value) if increasing else [Record(raw)]
+    records = [part for record in records for part in _divided(entry, kind, settings, record)]
     labels = [label] if len(records) == 1 else [f"{label}_{k + 1}" for k in range(len(records))]
     for own, record in zip(labels, records, strict=True):
         one, drift = record.raw, record.drift
@@ -417,6 +419,26 @@ def _records(
         tables.append((replace(table, findings=(*findings, *record.findings)), replace(one, columns=())))
         findings = ()
     return tables
+
+
+def _divided(entry: Node, kind: KindRule, settings: Settings, record: Record) -> list[Record]:
+    """The parts of a record, by the rule of its kind; the finding names the times of each, and those of none."""
+    raw = record.raw
+    if kind.divide is None or "time" not in raw.names:
+        return [record]
+    columns = {name: _to_si(raw, index, kind.columns[name]).values for index, name in enumerate(raw.names)}
+    owners = kind.divide(entry, columns, settings)
+    if owners is None:
+        return [record]
+    edges = [0, *(1 + np.flatnonzero(np.diff(owners))), len(owners)]
+    spans = [
+        (owners[a] >= 0, f"{columns['time'][a]:.6g} to {columns['time'][b - 1]:.6g} s") for a, b in pairwise(edges)
+    ]
+    used, left = (", ".join(text for own, text in spans if own == kept) for kept in (True, False))
+    parts = raw.divided(owners)
+    facts = {"file": _file_nodes(entry)[0].value, "records": len(parts), "used": used, "left": left or "nothing"}
+    done = Finding("times.parts", "ok", facts)
+    return [Record(part, record.drift, () if k else (*record.findings, done)) for k, part in enumerate(parts)]
 
 
 def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]:

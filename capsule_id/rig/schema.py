@@ -18,6 +18,8 @@ from typing import (
     runtime_checkable,
 )
 
+import numpy as np
+
 from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.rig.formats.raw import RawTable
@@ -296,6 +298,8 @@ class KindRule:
     parameters : rows of the parameters that only experiments of this kind have
     bench : a bench test; else a forced run
     read_by : what may be stated of the instruments of its columns, besides a clock: gain and offset
+    divide : the number, from 0, of the part of a record that a row belongs to, (n,), -1 for none; each part is a record.
+        Its arguments are the entry, columns in SI, and the settings. None: it stays whole
     """
 
     name: str
@@ -311,6 +315,7 @@ class KindRule:
     parameters: tuple[Parameter, ...] = ()
     bench: bool = True
     read_by: tuple[str, ...] = ()
+    divide: Callable[[Node, Mapping[str, np.ndarray], Any], np.ndarray | None] | None = None
 
     @cached_property
     def setting_rules(self) -> Mapping[str, SettingRule]:

@@ -1,7 +1,6 @@
 """Times as loggers write them: clocks that start anew, times that repeat, and why others do not increase."""
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -88,11 +87,8 @@ def records_of(raw: RawTable, file: str) -> list[Record]:
         "ok",
         {"file": file, "records": len(starts) - 1, "lines": " ".join(map(str, raw.rows[starts[1:-1]]))},
     )
-    ends, found = [0, *raw.rows[starts[1:-1]].tolist(), np.inf], list[Record]()
-    for k, (begin, end) in enumerate(pairwise(starts)):
-        lost = raw.lost[(raw.lost >= ends[k]) & (raw.lost < ends[k + 1])]
-        found.append(_in_order(replace(raw.taken(np.arange(begin, end)), lost=lost), file, (done,) * (k == 0)))
-    return found
+    owners = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    return [_in_order(part, file, (done,) * (k == 0)) for k, part in enumerate(raw.divided(owners))]
 
 
 def _in_order(raw: RawTable, file: str, findings: tuple[Finding, ...]) -> Record:

@@ -12,6 +12,7 @@ import pytest
 
 from capsule_id.api import fit, read_rig
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.readings import RELEASES
 from capsule_id.experiments.kind import (
     BUILT_IN,
     CHOICES,
@@ -60,6 +61,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         **_GROUND,
         "start": (QuantityRule("s", ANY), None),
         "stop": (QuantityRule("s", ANY), None),
+        "releases": (RELEASES, None),
         "capsule": (ChoiceRule(("held", "free")), "held"),
         "damping": (WordsRule(("viscous", "dry", "quadratic")), None),
         "stiffness": (ChoiceRule(("linear", "cubic")), None),

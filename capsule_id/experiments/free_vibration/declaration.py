@@ -26,6 +26,7 @@ from capsule_id.experiments.free_vibration.readings import (
     channel_of,
     cut_at_release,
     decay_window,
+    divide_at_releases,
     first_periods,
 )
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
@@ -284,6 +285,8 @@ TEMPLATE = """\
 #: the part of the record that is free decay; default: from the release, where rest before it is found, to the end
 # start = { value = 0.0, unit = "s" }
 # stop = { value = 0.5, unit = "s" }
+#: several releases in one record, in place of start and stop: "all", or numbers such as [1, 3]; each is a decay of its own
+# releases = "all"
 #: "held" (default) or "free"
 # capsule = "held"
 #: "viscous" (default); "dry", "quadratic" or a list of them add to the viscous damping: F_dry, c_q
@@ -325,6 +328,7 @@ KIND = Kind(
     sets=(("time",),),
     channels=tuple(CHANNELS),
     settings=DecaySettings,
+    divide=divide_at_releases,
     rules=(
         Entry.check_spring_with_gap,
         _check_settings,

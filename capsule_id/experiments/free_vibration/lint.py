@@ -35,7 +35,7 @@ from capsule_id.experiments.lint import (
 )
 from capsule_id.parameters import parameter
 from capsule_id.records.faults import aliases, sampling
-from capsule_id.records.release import FreeDecay, find_free_decay
+from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
 from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
@@ -211,16 +211,21 @@ def _held(table: Table[Any], rows: Iterable[Row]) -> Iterable[Finding]:
 def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Finding]:
     """Report rest before the release, and a second excitation; a ``faulty`` record may feign the latter."""
     start, stop = release_time(decay), decay.stop
-    earlier = stop is not None and decay.end is None
+    earlier, settings = stop is not None and decay.end is None, table.settings
+    alone = (settings.start, settings.stop, settings.releases) == (None, None, None)
+    channel = next(name for name in table.columns if name != "time")
+    several = find_releases(table["time"], table[channel], channel == "x_rel") if alone and (stop or decay.rest) else []
+    add = f' Or fit all of its {len(several)} releases: add releases = "all" instead.' if several else ""
     rest: Facts = {
         "file": table.file,
         "rest": decay.rest,
         "start": start,
         "before": "slow approach to the first turning point" if decay.pushed else "rest or excitation",
-        "longer": "" if decay.pushed else ". To keep a longer part, state an earlier start.",
+        "longer": ("" if decay.pushed else ". To keep a longer part, state an earlier start.") + add,
     }
     digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
     other = " For the part after that, add instead: " + line_of("start").format(start=start) if earlier else ""
+    other += add
     second: Facts = {"file": table.file, "stop": round(stop or 0.0, digits), "found": stop, "other": other}
     stated = table.settings.start is not None
     rows: tuple[Row, ...] = (

@@ -1,6 +1,6 @@
 """Readings of free decays: channels, block means, settings, and the window that contains the decay."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
@@ -10,11 +10,11 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, OF_DERIVATIVE, SIGN_ERRORS, derivative_ratio, phasor
-from capsule_id.records.release import FreeDecay, find_free_decay
+from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
 from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
-from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, QuantityRule, WordsRule
-from capsule_id.rig.toml import ANY, NOT_NEGATIVE
+from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, PlainRule, QuantityRule, WordsRule
+from capsule_id.rig.toml import ANY, NOT_NEGATIVE, Node, is_count, shown
 from capsule_id.views import Facts, Finding, Message
 
 # channels: Channels of a free decay: the displacement x_rel, its rate, or the rod's absolute acceleration.
@@ -265,6 +265,14 @@ def further_parameters(symbols: Sequence[str], k1: float, m1: float, size: float
     return [parameter(symbol, prior=priors[symbol]) for symbol in symbols]
 
 
+#: Which of several releases in one record are fitted.
+RELEASES = PlainRule(
+    lambda value: value == "all" or (isinstance(value, list) and bool(value) and all(map(is_count, value))),
+    'be "all" or a list of numbers, counted from 1',
+    'write releases = "all", or releases = [1, 3]',
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class DecaySettings(GroundSettings):
     """Settings of a free vibration, SI.
@@ -275,6 +283,7 @@ class DecaySettings(GroundSettings):
 
     start: Annotated[float | None, QuantityRule("s", ANY)] = None
     stop: Annotated[float | None, QuantityRule("s", ANY)] = None
+    releases: Annotated[str | list[int] | None, RELEASES] = None
     capsule: Literal["held", "free"] = "held"
     damping: Annotated[tuple[str, ...] | None, WordsRule(("viscous", *DAMPING))] = None
     stiffness: Literal["linear", "cubic"] | None = None
@@ -451,3 +460,32 @@ def cut_at_release(table: Table[DecaySettings]) -> Table[DecaySettings]:
     if decay is None or decay.rest == 0.0:
         return table
     return replace(table, settings=replace(settings, start=release_time(decay)))
+
+
+def divide_at_releases(entry: Node, columns: Mapping[str, np.ndarray], settings: DecaySettings) -> np.ndarray | None:
+    """The number of the decay, from 0, that each row belongs to, (n,), -1 for none; None where no releases are stated.
+
+    Raises
+    ------
+    InputError
+        Beside settings of a single decay, or where fewer releases are found than stated.
+    """
+    wanted, channel = settings.releases, next((name for name in CHANNELS if name in columns), None)
+    if wanted is None or channel is None:
+        return None
+    for key in ("start", "stop", "samples"):
+        if key in entry:
+            rule = f"releases finds each decay of a record by itself, and takes no {key}"
+            raise entry[key].error(rule, "both", f"remove {key}, or releases", of_key=True)
+    found = find_releases(columns["time"], columns[channel], channel == "x_rel")
+    if not found:
+        rule, remedy = "releases needs a record of several releases", "remove releases: one decay is found without it"
+        raise entry["releases"].error(rule, "fewer than two found", remedy)
+    chosen = [k + 1 for k in range(len(found))] if isinstance(wanted, str) else wanted
+    if max(chosen) > len(found) or len(set(chosen)) < len(chosen):
+        rule = f"releases must name some of the {len(found)} releases found, each once"
+        raise entry["releases"].error(rule, shown(wanted), 'correct the numbers, or write "all"')
+    owners = np.full(len(columns["time"]), -1)
+    for k, number in enumerate(sorted(chosen)):
+        owners[found[number - 1]] = k
+    return owners

@@ -298,6 +298,12 @@ class RawTable:
 
         return replace(self, columns=tuple(one[rows] for one in self.columns), rows=self.rows[rows], place=place)
 
+    def divided(self, owners: np.ndarray) -> list["RawTable"]:
+        """The tables of the rows that part 0, 1, ... owns, (n,); -1: none does. A lost row belongs to the row before it."""
+        lost = owners[np.maximum(np.searchsorted(self.rows, self.lost) - 1, 0)]
+        parts = range(int(np.max(owners)) + 1)
+        return [replace(self.taken(np.flatnonzero(owners == k)), lost=self.lost[lost == k]) for k in parts]
+
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""
         return InputError(rule, value, remedy, *self.place(row, self.names.index(name)))
