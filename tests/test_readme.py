@@ -248,6 +248,16 @@ def test_the_list_of_public_names_is_whole() -> None:
 OF_DATA = {"run.csv": "run_1.csv", "motor.csv": "motor_current.csv", "decay.csv": "free_vibration_1.csv"}
 
 
+def two_releases() -> pd.DataFrame:
+    """A pull, a hold and a decay, twice."""
+    t = np.arange(1500) / 1000.0
+    one = np.concatenate(
+        [2.0 * np.linspace(0.0, 1.0, 400), np.full(300, 2.0), 2.0 * np.exp(-6.0 * t) * np.cos(70.0 * t)]
+    )
+    x_rel = np.tile(one, 2) + 0.004 * np.random.default_rng(0).standard_normal(2 * len(one))
+    return pd.DataFrame({"time [s]": np.arange(len(x_rel)) / 1000.0, "x_rel [mm]": x_rel})
+
+
 @pytest.mark.parametrize("block", blocks("toml", GUIDE["how_to"]), ids=lambda block: block.splitlines()[-1][:20])
 def test_the_lines_of_the_how_tos_are_read(block: str, tmp_path: Path) -> None:
     """Each block with the file that it names, beside the masses; lines without an experiment act on a decay."""
@@ -257,14 +267,15 @@ def test_the_lines_of_the_how_tos_are_read(block: str, tmp_path: Path) -> None:
     text = rig + (block + first if "model" in content else first + block)
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
     for entry in tomllib.loads(text)["experiment"]:
-        table = pd.read_csv(ROOT / "data" / OF_DATA[entry["file"]])
+        table = two_releases() if "releases" in entry else pd.read_csv(ROOT / "data" / OF_DATA[entry["file"]])
         if "P_d" in entry:
             table = table.drop(columns="current [A]")
         if "columns" in entry:
             table.columns = [column["from"] for column in entry["columns"].values()]
         table.to_csv(tmp_path / entry["file"], index=False)
     rig_read = cid.read_rig(tmp_path)
-    assert [table.kind for table in rig_read.tables] == [each["kind"] for each in tomllib.loads(text)["experiment"]]
+    kinds = [each["kind"] for each in tomllib.loads(text)["experiment"] for _ in range(1 + ("releases" in each))]
+    assert [table.kind for table in rig_read.tables] == kinds
 
 
 def test_the_exit_codes_are_those_of_the_command() -> None:

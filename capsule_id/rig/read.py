@@ -424,7 +424,7 @@ def _records(
 def _divided(entry: Node, kind: KindRule, settings: Settings, record: Record) -> list[Record]:
     """The parts of a record, by the rule of its kind; the finding names the times of each, and those of none."""
     raw = record.raw
-    if kind.divide is None or "time" not in raw.names:
+    if kind.divide is None or "time" not in raw.names or not isinstance(settings, kind.settings):
         return [record]
     columns = {name: _to_si(raw, index, kind.columns[name]).values for index, name in enumerate(raw.names)}
     owners = kind.divide(entry, columns, settings)

@@ -270,6 +270,7 @@ RELEASES = PlainRule(
     lambda value: value == "all" or (isinstance(value, list) and bool(value) and all(map(is_count, value))),
     'be "all" or a list of numbers, counted from 1',
     'write releases = "all", or releases = [1, 3]',
+    {"anyOf": [{"const": "all"}, {"type": "array", "minItems": 1, "items": {"type": "integer", "minimum": 1}}]},
 )
 
 
