@@ -285,8 +285,7 @@ TEMPLATE = """\
 #: the part of the record that is free decay; default: from the release, where rest before it is found, to the end
 # start = { value = 0.0, unit = "s" }
 # stop = { value = 0.5, unit = "s" }
-#: several releases in one record, in place of start and stop: "all", or numbers such as [1, 3]; each is a decay of its own
-# releases = "all"
+#: several releases in one record, each a decay of its own: releases = "all", or [1, 3], in place of start and stop
 #: "held" (default) or "free"
 # capsule = "held"
 #: "viscous" (default); "dry", "quadratic" or a list of them add to the viscous damping: F_dry, c_q
