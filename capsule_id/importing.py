@@ -1,6 +1,7 @@
 """Describes an export, guesses its kind and columns, and writes the entry of ``rig.toml`` that reads it."""
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -315,6 +316,8 @@ def read_file(path: Path) -> bytes:
 def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
     """The lines of ``[[experiment]]`` for one export, and the guess; without a guess the lines are comments.
 
+    A workbook has such lines for each of its sheets with numbers, and the guess is that of the first one.
+
     Parameters
     ----------
     content, path : the bytes of the file, and its path; ``rig.toml`` names it without the folder
@@ -325,9 +328,20 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
     InputError
         If the file cannot be read.
     """
-    found = find_layout(content, path, dimensions_of(kinds))
-    guessed = guess(found, kinds)
-    return _entry(found, guessed, content, kinds), guessed
+    dimensions = dimensions_of(kinds)
+    found = find_layout(content, path, dimensions)
+    guessed, others = guess(found, kinds), found.export.others
+    if others:
+        found = replace(found, layout=replace(found.layout, sheet=found.export.sheet))
+    entries = [_entry(found, guessed, content, kinds)]
+    for sheet in others:
+        try:
+            other = find_layout(content, path, dimensions, sheet)
+        except InputError as error:
+            entries.append(f"#: Sheet {sheet!r} is not read: {error.rule}, {' '.join(error.value.split())}.\n")
+        else:
+            entries.append(_entry(other, guess(other, kinds), content, kinds))
+    return "\n".join(entries), guessed
 
 
 def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Mapping[str, Kind]) -> str:
@@ -410,11 +424,14 @@ def _description(found: FoundLayout, content: bytes) -> str:
 def _layout_lines(found: FoundLayout) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
     used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
+    label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{found.export.path.stem}_{used.sheet}") if used.sheet else None
     longest = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
     for key, value, confidence, reason in (
         ("data_from_line", used.data_from_line, "sure", "the first row of readings"),
         ("data_to_line", used.data_to_line, "likely", longest if len(found.blocks) > 1 else "the last row of readings"),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),
+        ("sheet", used.sheet, "sure", "several sheets hold numbers, each has an entry"),
+        ("label", label, "sure", "names of experiments differ"),
     ):
         if value is not None:
             yield _commented(f"{key} = {json.dumps(value, ensure_ascii=False)}", confidence, reason)
@@ -536,7 +553,7 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
     for row in [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]:
         cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
         lines.append(f"line {found.export.lines[row]}: {'  '.join(cells)}")
-    return [*lines, "", _entry(found, guessed, content, kinds).rstrip()]
+    return [*lines, "", entry_of(content, path, kinds)[0].rstrip()]
 
 
 def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:

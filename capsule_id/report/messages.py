@@ -232,6 +232,10 @@ DATA_MESSAGES: Mapping[str, Message] = {
         ok=_DROPPED,
         warn=_missing,
     ),
+    "readings.sheets": Message(
+        "sheets",
+        ok="{file}: read from sheet {sheet!r}. Not read: {others}, which hold numbers too. Name one by sheet, an entry each.",
+    ),
     "times.stamps": Message(
         "time stamps", ok="{file}: {rows:# time stamp} are read as seconds since the first one, over midnight too."
     ),

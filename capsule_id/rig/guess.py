@@ -224,7 +224,7 @@ class FoundLayout:
         return name, (text or self.units[index]).strip()
 
 
-def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundLayout:
+def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: str | None = None) -> FoundLayout:
     """The layout of a file of a known format.
 
     Parameters
@@ -232,6 +232,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     content : the bytes of the file
     path : its name
     dimensions : SI units of all columns of all kinds
+    sheet : of a workbook (None: the first one with numbers)
 
     Raises
     ------
@@ -245,7 +246,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     text = suffix.removesuffix(COMPRESSED) in TEXTS and not suffix.startswith(".lvm")
     beginning = _beginning(TextFile(content, path)) if text else b""
     blocks: tuple[tuple[int, int], ...] = ()
-    layout = Layout(missing=NO_READING)
+    layout = Layout(missing=NO_READING, sheet=sheet)
 
     def read(layout: Layout) -> tuple[Export, tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]]:
         """The export, and what ``_readings`` finds in it: a column of readings at least."""

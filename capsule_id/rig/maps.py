@@ -213,6 +213,12 @@ LAYOUT: Mapping[str, SettingRule] = {
         {"type": "array", "items": {"type": "string"}},
     ),
     "decimal": ChoiceRule((".", ",")),
+    "sheet": PlainRule(
+        lambda value: isinstance(value, str) and bool(value),
+        "be the name of a sheet",
+        'write sheet = "Sheet1"',
+        {"type": "string"},
+    ),
 }
 #: Keys of an experiment that go with ``columns``.
 MAP_KEYS = ("columns", "files", *LAYOUT, "where", "plateaus")

@@ -361,7 +361,7 @@ def read_tables(
             ) from None
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     first = files[nodes[0].value]
-    plateaus = read_plateaus(entry, kind)
+    plateaus, seen = read_plateaus(entry, kind), list[Finding]()
     column_map = read_map(entry, kind, partial(_proposal, first, kind))
     if column_map is None:
         raw = _read_plain(nodes[0], first, contents.pop(nodes[0].value), kind)
@@ -377,11 +377,16 @@ def read_tables(
         }
         raw = apply_map(entry, list(exports.values()), column_map)
         encodings = {name: export.encoding for name, export in exports.items()}
+        for name, export in exports.items():
+            if "sheet" in entry and not export.sheet:
+                raise entry["sheet"].error("sheet needs a workbook (.xlsx)", shown(name), "remove sheet", of_key=True)
+            if export.others and "sheet" not in entry:
+                facts = {"file": name, "sheet": export.sheet, "others": ", ".join(map(repr, export.others))}
+                seen.append(Finding("readings.sheets", "ok", facts))
         del exports
-    stamps: tuple[Finding, ...] = ()
     if column_map is not None and any(source.unit == STAMP for source in column_map.sources.values()):
-        stamps = (Finding("times.stamps", "ok", {"file": nodes[0].value, "rows": len(raw.rows)}),)
-    tables = _records(entry, kind, label, settings, raw, plateaus, stamps)
+        seen.append(Finding("times.stamps", "ok", {"file": nodes[0].value, "rows": len(raw.rows)}))
+    tables = _records(entry, kind, label, settings, raw, plateaus, tuple(seen))
     return [(replace(table, encodings=encodings), written) for table, written in tables], hashes
 
 

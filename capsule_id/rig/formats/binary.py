@@ -1,6 +1,7 @@
 """Readers of binary files: HDF5, MATLAB, NumPy, Parquet, TDMS, Excel."""
 
 import io
+import itertools
 import json
 import logging
 import os
@@ -28,6 +29,7 @@ from capsule_id.rig.formats.raw import (
     UNIT_NAMES,
     Export,
     Layout,
+    Place,
     complete,
     export_of_arrays,
     largest,
@@ -392,6 +394,8 @@ read_tdms = partial(_read_arrays, _channels, "export it again, or as text", "npT
 MOST_CELLS = 2_000_000
 #: Cells that a row without cells counts.
 BLANK_ROW = 20
+#: Rows of a further sheet in which a number is looked for.
+SEARCHED_ROWS = 1000
 
 
 def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
@@ -411,7 +415,7 @@ def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
         If openpyxl is not installed, the file is damaged or too large, or the rows of numbers are not found.
     """
     require("openpyxl", path)
-    lines = _lines_of_book(content, path)
+    lines, sheet, others = _lines_of_book(content, path, layout.sheet)
     try:
         export = read_text("\n".join(lines).encode(), path, layout)
     except InputError as error:
@@ -423,24 +427,45 @@ def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
         except InputError as error:
             raise _in_sheet(error, lines) from None
 
-    return replace(export, values=values, place=lambda row, column: (*export.place(row, column)[:2], column + 1))
+    def place(row: int | None, column: int) -> Place:
+        return (*export.place(row, column)[:2], column + 1)
+
+    return replace(export, values=values, place=place, sheet=sheet, others=others)
 
 
 @lru_cache(maxsize=1)  # the guesses of a layout read a file several times
-def _lines_of_book(content: bytes, path: Path) -> list[str]:
-    """The first sheet with numbers as lines of text, the cells between tabs."""
+def _lines_of_book(content: bytes, path: Path, chosen: str | None) -> tuple[list[str], str, tuple[str, ...]]:
+    """A sheet as lines of text, the cells between tabs, its name, and those of other sheets with numbers.
+
+    ``chosen`` None: the first sheet with numbers.
+    """
     import openpyxl
 
     with complete(path, "save it again"):
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             refuse_large(sum(member.file_size for member in archive.infolist()), content, path)
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
-        sheets = (_rows(sheet, path) for sheet in book.worksheets)
-        rows = next((rows for rows, numbers in sheets if numbers), [])
+        if chosen is not None and chosen not in book.sheetnames:
+            known = ", ".join(map(repr, book.sheetnames))
+            raise InputError("sheet must be one of the workbook", repr(chosen), f"choose from {known}", path)
+        name, rows, others = chosen or "", list[list[str]](), list[str]()
+        for sheet in book.worksheets:
+            if sheet.title == chosen or not name:
+                found, numbers = _rows(sheet, path)
+                if numbers or chosen:
+                    name, rows = sheet.title, found
+            elif hasattr(sheet, "iter_rows"):
+                first = itertools.islice(sheet.iter_rows(values_only=True), SEARCHED_ROWS)
+                others += [sheet.title] * any(_is_number(cell) for row in first for cell in row)
     width = max((k + 1 for row in rows for k, cell in enumerate(row) if cell), default=0)
     if width * len(rows) > SPREAD * MOST_CELLS:
         raise _too_many(path)
-    return ["\t".join([*row[:width], *[""] * (width - len(row)), ""]) if any(row) else "" for row in rows]
+    lines = ["\t".join([*row[:width], *[""] * (width - len(row)), ""]) if any(row) else "" for row in rows]
+    return lines, name, tuple(others)
+
+
+def _is_number(cell: object) -> bool:
+    return isinstance(cell, int | float) and not isinstance(cell, bool)
 
 
 def _too_many(path: Path) -> InputError:
@@ -459,7 +484,7 @@ def _rows(sheet: Any, path: Path) -> tuple[list[list[str]], bool]:
         cells += len(row) or BLANK_ROW  # the stated number of a row can lie far below the last one
         if cells > MOST_CELLS:
             raise _too_many(path)
-        real = [isinstance(cell, int | float) and not isinstance(cell, bool) for cell in row]
+        real = [*map(_is_number, row)]
         numbers = numbers or any(real)
         texts = zip(row, real, strict=True)
         rows.append([repr(float(c)) if n else "" if c is None else " ".join(str(c).split()) for c, n in texts])

@@ -324,6 +324,7 @@ class Layout:
     decimal : decimal mark of a text table, "." or "," (None: found in the file)
     columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
     words : headers, or numbers counted from 1, of those whose texts it keeps too
+    sheet : name of the sheet of a workbook (None: the first one with numbers)
     """
 
     data_from_line: int | None = None
@@ -332,6 +333,7 @@ class Layout:
     decimal: str | None = None
     columns: tuple[str | int, ...] | None = None
     words: tuple[str | int, ...] = ()
+    sheet: str | None = None
 
 
 @dataclass(frozen=True)
@@ -349,6 +351,7 @@ class Export:
     place : (row index or None for the header, column index) -> where the cell stands
     encoding : of a text
     words : index of a column that ``Layout.words`` names -> (rows,) its texts; None: the format has no texts
+    sheet, others : names of the sheet of a workbook that was read, "" of another format, and of others with numbers
     """
 
     path: Path
@@ -359,6 +362,8 @@ class Export:
     place: Callable[[int | None, int], Place]
     encoding: str = "UTF-8"
     words: Callable[[int], np.ndarray] | None = None
+    sheet: str = ""
+    others: tuple[str, ...] = ()
 
 
 # arrays: Makes an export of named arrays: the form of every format without lines.
