@@ -14,14 +14,14 @@ PLURAL = re.compile(
     r"\{(?:len\([^{}]*\)|[a-z_\[\]'.]*(?:count|number|rows|samples|records|settings|lost|shared))[^{}:]*\}"
     r"(?: [a-z-]+)? [a-z]{2,}[^s ]s\b"
 )
-#: Counts that are two or more: blocks of readings, errors beyond the twentieth, laws and decays compared, rows of a
+#: Counts that are two or more: blocks of readings, releases, errors beyond the twentieth, laws and decays compared, rows of a
 #: trend, bytes and samples of a record, levels.
 SEVERAL = {
     "{len(self.errors)} errors", "{view.samples} samples", "{len(deepest)} levels", "{len(content)} bytes",
     "{count} plateaus", "{len(parts)} plateaus", "{len(view.time)} samples", "{len(view.section_x_rel)} points",
     "{len(names)} parameters", "{samples} samples", "{len(values)} samples", "{records} records",
     "{rows} rows", "{count} friction laws",
-    "{len(found.columns)} with numbers", "{len(found.blocks)} blocks",
+    "{len(found.columns)} with numbers", "{len(found.blocks)} blocks", "{len(found)} releases", "{len(several)} releases",
 }  # fmt: skip
 
 

@@ -112,7 +112,9 @@ def _summary(found: "Tuning") -> str:
     ]
     if found.failed:
         lines.append(f"{counted(found.failed, 'setting')} left out: the motion of a draw could not be computed")
-    lines.append(f"settled motions of this setting, by share of draws and initial states ({len(share)} kinds):")
+    lines.append(
+        f"settled motions of this setting, by share of draws and initial states ({counted(len(share), 'kind')}):"
+    )
     lines.append(found.motions.head(MOST_MOTIONS).to_string(float_format="%.3g"))
     lines.append("mean velocity where one parameter or setting changes, mm/s:")
     lines.append(found.sensitivity.to_string(float_format="%.4g"))

@@ -42,7 +42,7 @@ def list_names(app: Any, what: str, name: str, thing: Any, options: Any, lines: 
 def lead_to_the_first_page(app: Any, exception: Exception | None) -> None:
     """The first page of the site stands in a folder; ``index.html`` at the top leads there."""
     page = f'<meta http-equiv="refresh" content="0; url={root_doc}.html"><a href="{root_doc}.html">{project}</a>'
-    (Path(app.outdir) / "index.html").write_text(page, encoding="utf-8")
+    (Path(app.outdir) / "index.html").write_text(page, encoding="utf-8", newline="\n")
 
 
 def setup(app: Any) -> None:
