@@ -11,6 +11,7 @@ from capsule_id.errors import InputError
 Option = tuple[Any, ...]
 PATH: dict[str, Any] = {"type": Path}
 NO_CACHE: Option = ("--no-cache", "", "compile everything anew, and keep no compiled program")
+QUIET: Option = ("--quiet", "", "no progress on standard error")
 
 
 def add_options(parser: argparse.ArgumentParser, options: Mapping[str, Sequence[Option]]) -> None:

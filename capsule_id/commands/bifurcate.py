@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from capsule_id.commands import NO_CACHE, PATH
+from capsule_id.commands import NO_CACHE, PATH, QUIET
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.simulate import (
     DEFAULTS,
@@ -182,7 +182,7 @@ OPTIONS = {
     "execution and output": (
         ("--scheduler", "S", "Dask for maps and bands: threads, processes or an address tcp://..."),
         ("--resume", "", "reuse the finished blocks of an interrupted map"),
-        ("--quiet", "", "no progress on standard error"),
+        QUIET,
         ("--out", "FILE", "FILE.nc; the figure is FILE.png (default results/<rig>-<quantity>.nc)", PATH),
         NO_CACHE,
     ),

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from capsule_id.commands import NO_CACHE, PATH, rig_folders
+from capsule_id.commands import NO_CACHE, PATH, QUIET, rig_folders
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.rigs import fit_many, fit_one
 from capsule_id.console import Progress, say
@@ -57,7 +57,7 @@ OPTIONS = {
             "compare models instead of a fit: some of friction,reaction,lag,cubic; needs a progression. With --no-sample "
             "roughly, by the point fits alone",
         ),
-        ("--quiet", "", "no progress on standard error"),
+        QUIET,
         NO_CACHE,
     )
 }

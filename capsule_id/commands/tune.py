@@ -4,7 +4,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
-from capsule_id.commands import NO_CACHE, PATH
+from capsule_id.commands import NO_CACHE, PATH, QUIET
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.predict import check_new_files
 from capsule_id.commands.simulate import number, whole_number
@@ -34,7 +34,7 @@ OPTIONS = {
     "output": (
         ("--out", "FILE", "FILE.csv: the table; FILE.json: all numbers; a new file", {**PATH, "required": True}),
         ("--figure", "PNG", "map of the mean velocity, a new file", PATH),
-        ("--quiet", "", "no progress on standard error"),
+        QUIET,
         NO_CACHE,
     ),
 }

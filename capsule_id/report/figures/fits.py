@@ -259,7 +259,7 @@ def profile(note: ResultTable, ax: Axes) -> None:
     ax.plot(value, note.frame["profile"], color=BLUE, marker="o", ms=3.5, lw=1.4, label="profile")
     ax.plot(value, note.frame["curvature"], color=GREY, ls="--", lw=1.0, label="curvature")
     ax.axhline(-drop, color=BLACK, ls=":", lw=0.9, label="95 %")
-    ax.set_ylim(-4.0 * drop, 0.4 * drop)
+    ax.set_ylim(max(-4.0 * drop, 1.1 * min(note.frame["profile"].min(), -drop)), 0.4 * drop)
     set_text(ax, with_unit(plain_symbol(note.facts["name"]), note.facts["unit"]), "log-likelihood less its maximum")
     set_legend(ax, "above")
 
