@@ -102,7 +102,10 @@ def lint_slides(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 
 
 CAPTIONS = {
-    "friction": "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off (of pushes also what they mean at their speed), its curve, and ours."
+    "friction": (
+        "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours. Pushes stand at "
+        "what they mean at their speed, too."
+    )
 }
 
 #: A friction coefficient holds the viscous part as a force per weight.
