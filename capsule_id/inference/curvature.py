@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 
 from capsule_id.errors import InputError
-from capsule_id.physics.batches import in_batches
 
 # covariance: Covariance of the parameters at a minimum of least squares, from the singular values of the Jacobian.
 
@@ -93,7 +92,7 @@ def hessian(terms: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector,
     estimates, beyond = [], np.zeros((len(rows), 1 + len(alone)), dtype=bool)
     for step in (STEP, RATIO * STEP):
         offsets = step * np.concatenate([pair, -pair, single, -single])
-        values = in_batches(terms, np.concatenate([u + offsets, u[None]]))
+        values = terms(np.concatenate([u + offsets, u[None]]))
         parts = np.stack(np.split(values[:-1], 4))
         # Beyond the domain the density is -inf; a NaN is a defect, and stays.
         beyond |= np.any(np.isneginf(parts), axis=0)

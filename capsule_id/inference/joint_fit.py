@@ -16,11 +16,10 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.inference.curvature import covariance
 from capsule_id.inference.least_squares import KINKED, LeastSquaresFit, Solver, least_squares, linearised
-from capsule_id.inference.marginal import density_of
+from capsule_id.inference.marginal import density_of, rows_of
 from capsule_id.inference.point_fit import AGREEMENT, described, dispersed_starts
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
-from capsule_id.physics.batches import BATCH, in_batches
 from capsule_id.views import counted
 
 # joint starts: Starting points of the joint fit: the bench estimates and the best of many candidates around them.
@@ -107,10 +106,10 @@ def descended(target: LogPosterior, u: np.ndarray, steps: int | None = None) -> 
 
 def weigh(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """(n,) log-posterior of u (n, d), one compiled batch for any n; -inf where it is not finite."""
-    density = density_of(target)
+    density, rows = density_of(target), rows_of(target)
     # The first batch compiles the program that all threads then call.
-    first, rest = in_batches(density, u[:BATCH]), u[BATCH:]
-    return np.concatenate([first, in_batches(density, rest)]) if len(rest) else first
+    first, rest = density(u[:rows]), u[rows:]
+    return np.concatenate([first, density(rest)]) if len(rest) else first
 
 
 # joint fit: Joint point fit of bench tests and forced runs.

@@ -19,8 +19,8 @@ from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.curvature import require_width
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target import HEAVY, LogPosterior, Scale
-from capsule_id.physics.batches import BATCH, in_batches
+from capsule_id.inference.target import HEAVY, LogPosterior, Scale, half_ensemble
+from capsule_id.physics.batches import in_batches
 from capsule_id.precision import COMPILE
 
 # quadrature: Quadrature nodes of the integrals over scatters.
@@ -235,6 +235,7 @@ class MarginalPosterior:
         self._located, self._scatter = np.array(self._layout.located), np.array(self._layout.scatter, dtype=int)
         self._label = np.array(self._layout.block)
         self.dimension = len(self._located)
+        self.rows = rows_of(target)
         self.centre, self.covariance = fit.u[self._located], fit.covariance[np.ix_(self._located, self._located)]
         require_width(located := [self.names[i] for i in self._located], self.centre, self.covariance)
         priors = target.priors.at(self._located, np)
@@ -267,7 +268,7 @@ class MarginalPosterior:
             known, _, integrals = self._terms(v, self.grid)
             return add_to_blocks(known, self._label[self._scatter], integrals)
 
-        values = in_batches(one, v)
+        values = in_batches(one, v, self.rows)
         # Scatters without located parameters in their block add a constant.
         return np.where(np.isfinite(values), values, -np.inf)[:, : len(self.blocks)]
 
@@ -327,7 +328,7 @@ class MarginalPosterior:
         size = self._layout.blocks
 
         def one(rows: np.ndarray) -> np.ndarray:
-            """(BATCH, 2 size + scatters) log-posterior of each block without and with its scatters, and the scatters."""
+            """(rows, 2 size + scatters) log-posterior of each block without and with its scatters, and the scatters."""
             v, shift, chance = np.split(rows, [self.dimension, self.dimension + len(label)], axis=1)
             shifted = grid.shifted(shift - 0.5)
             known, terms, integrals = self._terms(v, shifted)
@@ -341,7 +342,7 @@ class MarginalPosterior:
             return np.concatenate([*sums_by_block, position(t, grid.bend, np)], axis=1)
 
         parts, density, scatters = np.split(
-            in_batches(one, np.concatenate([v, random], axis=1)), [size, 2 * size], axis=1
+            in_batches(one, np.concatenate([v, random], axis=1), self.rows), [size, 2 * size], axis=1
         )
         block, place = self.kept
         found = np.zeros((len(v), blocks, 2 + np.max(place, initial=-1) + 1))
@@ -357,24 +358,22 @@ class MarginalPosterior:
         layout = replace(self._layout, nodes=grid.nodes)
         size = (len(v), len(self._scatter))
         start, step = np.broadcast_to(grid.start, size), np.broadcast_to(grid.step, size)
-        parts = [
-            conditional(layout, self.target, v[i : i + BATCH], start[i : i + BATCH], step[i : i + BATCH], grid.bend)
-            for i in range(0, len(v), BATCH)
-        ]
-        known, terms, integrals = zip(*parts, strict=True)
-        return np.concatenate(known), np.concatenate(terms), np.concatenate(integrals)
+        batches = [np.minimum(np.arange(i, i + self.rows), len(v) - 1) for i in range(0, len(v), self.rows)]
+        parts = [conditional(layout, self.target, v[i], start[i], step[i], grid.bend) for i in batches]
+        known, terms, integrals = (np.concatenate(each)[: len(v)] for each in zip(*parts, strict=True))
+        return known, terms, integrals
 
     def _probes(self) -> np.ndarray:
-        """(2 BATCH, dimension) located u: the point fit, and walkers at growing distances from it, twice.
+        """(4 rows, dimension) located u: the point fit, and walkers at growing distances from it, twice.
 
         Distances are in Laplace standard deviations, separately for each block.
         """
-        direction = np.random.default_rng(0).standard_normal((2 * BATCH, self.dimension))
+        direction = np.random.default_rng(0).standard_normal((4 * self.rows, self.dimension))
         for block in self.blocks:
             direction[:, block] /= np.linalg.norm(direction[:, block], axis=1, keepdims=True)
         kinked = self.target.kinked
         farthest = FARTHEST_WITH_KINKS if kinked else FARTHEST
-        radius = np.concatenate([[0.0], np.geomspace(NEAREST, farthest, BATCH - 1)])
+        radius = np.concatenate([[0.0], np.geomspace(NEAREST, farthest, 2 * self.rows - 1)])
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
 
 
@@ -387,6 +386,12 @@ def uniform_at(v: Float[np.ndarray, "w d"], number: int) -> Float[np.ndarray, "w
 def trials_of(target: LogPosterior) -> list[Progression]:
     """Its experiments with trials, whose motions can be emulated."""
     return [e for e in target.experiments if isinstance(e, Progression)]
+
+
+def rows_of(target: LogPosterior) -> int:
+    """Rows of one evaluation of the density of ``target``: half an ensemble; where it is heavy, whole groups of rows."""
+    half = half_ensemble(int(np.sum(~target.integrated)))
+    return half if target.work < HEAVY else -(-half // ROWS_TOGETHER) * ROWS_TOGETHER
 
 
 def density_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:
@@ -404,13 +409,13 @@ def terms_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:
     located, scatter = np.array(layout.located), np.array(layout.scatter, dtype=int)
     straight = np.full(len(scatter), -np.inf)
 
-    def terms(u: np.ndarray) -> np.ndarray:
+    def one(u: np.ndarray) -> np.ndarray:
         start = u[:, scatter]
         known, of_nodes, _ = conditional(layout, target, u[:, located], start, np.ones(start.shape), straight)
         found = np.concatenate([np.sum(known, axis=1, keepdims=True), np.asarray(of_nodes)[:, :, 0]], axis=1)
         return np.where(np.isfinite(found), found, -np.inf)
 
-    return terms
+    return lambda u: in_batches(one, u, rows_of(target))
 
 
 def _layout(target: LogPosterior) -> Layout:

@@ -19,7 +19,6 @@ from capsule_id.inference.marginal import density_of, terms_of
 from capsule_id.inference.result import STATED, PointFit
 from capsule_id.inference.target import LogPosterior, prior_of
 from capsule_id.parameters import is_stated
-from capsule_id.physics.batches import BATCH, in_batches
 
 # variance shares: Uncertainty budget of a point fit: how much every table and every prior contributes to the sd of a
 # parameter.
@@ -143,13 +142,13 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     located, density = target.located, density_of(target)
     # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:
-        compiled = pool.submit(density, np.repeat(starts[:1], BATCH, axis=0))
+        compiled = pool.submit(density, starts[:1])
         rough = least_squares(partial(linearised, target, starts[0]), starts[:, located], BASIN_SOLVER)
         compiled.result()
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
     # Least squares knows no scatter: it may end at a lower density than it began with.
-    before, after = in_batches(density, starts), in_batches(density, ends)
+    before, after = density(starts), density(ends)
     ends = np.where((after >= before)[:, None], ends, starts)
     best = int(np.argmax(np.nan_to_num(np.fmax(before, after), nan=-np.inf)))
     roots = root_of_covariance(target, ends[best], linearised(target, ends[best])[1])
@@ -202,7 +201,7 @@ def polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> t
     def objective(v: Vector) -> tuple[float, Vector]:
         """Negative log-posterior at whitened v (d,), and its gradient (d,): one batch for both, up to 15 directions."""
         w = rotation @ v
-        found = in_batches(terms, end + np.concatenate([w[None], w + steps, w - steps]) @ whitening.T)
+        found = terms(end + np.concatenate([w[None], w + steps, w - steps]) @ whitening.T)
         found = np.where(np.isfinite(found), found, LOG_POSTERIOR_FLOOR)
         centre, *sides = np.split(found, [1, 1 + len(steps)])
         slopes, gradient = (sides[0] - sides[1]) / (2.0 * GRADIENT_STEP), np.empty(d)

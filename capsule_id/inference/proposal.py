@@ -157,7 +157,7 @@ class Mixture:
 
     Attributes
     ----------
-    weights, drawn : (k,), (k, d) of the components, and the parameters that each draws from their priors
+    weights : (k,) of the components: of each subset of parameters that are drawn from their priors, the scales
     """
 
     def __init__(
@@ -169,27 +169,33 @@ class Mixture:
         subsets = [subset for number in range(MOST_DRAWN + 1) for subset in combinations(weak, number)]
         shares = np.full(len(subsets), FROM_PRIOR / max(len(subsets) - 1, 1))
         shares[0] = 1.0 - np.sum(shares[1:])
-        self.weights = np.outer(shares, WEIGHTS).ravel()
-        self.drawn = np.repeat([np.isin(np.arange(len(centre)), own) for own in subsets], len(scales), axis=0)
-        squares = np.tile(np.array(scales)[:, None, None] ** 2 * covariance, (len(subsets), 1, 1))
-        pairs = [_given(square, own) for square, own in zip(squares, self.drawn, strict=True)]
-        self._slopes, self._roots = (np.stack(each) for each in zip(*pairs, strict=True))
+        self.weights, self._scales = np.outer(shares, WEIGHTS).ravel(), np.array(scales)
+        self._subsets = np.array([np.isin(np.arange(len(centre)), own) for own in subsets])
+        self._slopes, self._roots = (
+            np.stack(each) for each in zip(*(_given(covariance, own) for own in self._subsets), strict=True)
+        )
         self._inverses = np.linalg.inv(self._roots)
-        freedom, d = self._freedom, np.sum(~self.drawn, axis=1)
+        freedom, d = self._freedom, np.sum(~self._subsets, axis=1)
         size = np.sum(np.log(np.diagonal(self._roots, axis1=1, axis2=2)), axis=1)
-        constant = gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom) - 0.5 * d * np.log(np.pi * freedom)
-        self._power, self._constant = 0.5 * (freedom + d), np.log(self.weights) + constant - size
+        constant = gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom) - 0.5 * d * np.log(np.pi * freedom) - size
+        self._power = 0.5 * (freedom + d)
+        constants = constant[:, None] - d[:, None] * np.log(self._scales)
+        self._constant = np.log(self.weights).reshape(constants.shape) + constants
 
     def components(self, u: Points) -> Float[np.ndarray, "k n"]:
         """Log-densities of u under the components, weights included."""
-        off = np.broadcast_to(self._coordinates.w(u) - self._centre, (len(self.weights), *u.shape))
-        left = np.where(self.drawn[:, None], 0.0, off - off @ self._slopes.transpose(0, 2, 1))
-        square = np.sum((left @ self._inverses.transpose(0, 2, 1)) ** 2, axis=2)
-        student = self._constant[:, None] - self._power[:, None] * np.log1p(square / self._freedom)
+        # Components of one subset differ in their scale alone.
+        off = np.broadcast_to(self._coordinates.w(u) - self._centre, (len(self._subsets), *u.shape))
+        kept = ~self._subsets[:, None]
+        if len(self._subsets) > 1:
+            off = np.where(kept, off - off @ self._slopes.transpose(0, 2, 1), 0.0)
+        square = np.sum((off @ self._inverses.transpose(0, 2, 1)) ** 2, axis=2)
+        square = square[:, None] / (self._freedom * self._scales[:, None] ** 2)
+        student = self._constant[..., None] - self._power[:, None, None] * np.log1p(square)
         # log |dw/du| is u for a parameter in theta.
-        jacobian = np.sum(np.where(self._coordinates.linear & ~self.drawn[:, None], u, 0.0), axis=2)
-        prior = np.sum(np.where(self.drawn[:, None], self._coordinates.prior_density(u), 0.0), axis=2)
-        return student + jacobian + prior
+        others = np.sum(np.where(self._coordinates.linear & kept, u, 0.0), axis=2)
+        others += np.sum(np.where(kept, 0.0, self._coordinates.prior_density(u)), axis=2)
+        return np.reshape(student + others[:, None], (len(self.weights), len(u)))
 
     def log_density(self, u: Points) -> PerPoint:
         with np.errstate(over="ignore"):  # far out squares overflow, and the density is 0
@@ -197,10 +203,10 @@ class Mixture:
 
     def draw(self, rng: Random, size: int) -> Points:
         """Draw u; NaN where theta is not positive."""
-        k = rng.choice(len(self.weights), size=size, p=self.weights)
-        scale = np.sqrt(self._freedom / rng.chisquare(self._freedom, size))
+        k, scale = np.divmod(rng.choice(len(self.weights), size=size, p=self.weights), len(self._scales))
+        scale = self._scales[scale] * np.sqrt(self._freedom / rng.chisquare(self._freedom, size))
         noise = scale[:, None] * rng.standard_normal((size, len(self._centre)))
-        drawn, coordinates, known = self.drawn[k], self._coordinates, np.zeros_like(noise)
+        drawn, coordinates, known = self._subsets[k], self._coordinates, np.zeros_like(noise)
         if coordinates.weak:
             known = np.where(drawn, coordinates.w(coordinates.draw_prior(rng, size)) - self._centre, 0.0)
         noise = np.where(drawn, 0.0, noise)

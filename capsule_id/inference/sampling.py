@@ -43,6 +43,7 @@ from capsule_id.inference.proposal import (
     refined,
 )
 from capsule_id.inference.result import Posterior
+from capsule_id.inference.target import half_ensemble
 
 # emulation: Emulation of a posterior whose motions take long: exact motions near the posterior, and emulators fitted
 # to them.
@@ -230,8 +231,6 @@ def _around(v: np.ndarray, random: Random) -> np.ndarray:
 
 #: Number of independent ensembles, enough for a split R-hat.
 ENSEMBLES = 4
-#: Smallest number of walkers of an ensemble: one batch of the log-posterior. There are at least two per parameter.
-MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 2
 #: Convergence requires more draws than this many autocorrelation times for every parameter. The time is an average
 #: over the walkers of all ensembles, 128 or more. Its standard error at this length is 10 % or less (Sokal 1997,
 #: eq. 3.19).
@@ -477,7 +476,7 @@ def _sampler(target: MarginalPosterior, schedule: Schedule, seed: int, backend: 
 
 def _initial(target: MarginalPosterior, density: BlockProposal | Places, random: Random) -> State:
     """Walkers drawn from ``density``, each at a finite log-posterior."""
-    walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
+    walkers = 2 * half_ensemble(target.dimension)
     u = np.empty((0, target.dimension))
     for _ in range(100):
         drawn = _finite(density, random, walkers)

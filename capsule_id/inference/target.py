@@ -249,8 +249,15 @@ def _check_leaves(experiment: Experiment) -> None:
 
 #: An evaluation takes long above this ``LogPosterior.work``, in readings.
 HEAVY = 30_000
+#: Half the walkers of the smallest ensemble.
+LEAST_HALF = 16
 #: Largest dispersion of starts that come from a prior alone, natural-log units.
 WIDEST_START = 0.3
+
+
+def half_ensemble(dimension: int) -> int:
+    """Half the walkers of an ensemble in so many dimensions: rows of one evaluation, which no walker leaves empty."""
+    return max(LEAST_HALF, dimension)
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,6 @@ Times = jax.Array | np.ndarray
 
 # Lanes per call of an engine: enough to fill the vector units, few enough for the second-level cache.
 CHUNK = 64
-# Points per call of another compiled function. A fixed number needs one compilation only.
-BATCH = 32
 
 
 class Record:
@@ -172,9 +170,12 @@ def folded(run: Callable[..., Result]) -> Callable[..., Result]:
 
 
 def in_batches(
-    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"], rows: int = BATCH
+    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"], rows: int
 ) -> Float[np.ndarray, "m ..."]:
-    """Evaluate ``function`` at points (m, d) in batches of exactly ``rows`` rows, on all cores; (m, ...)."""
+    """Evaluate ``function`` at points (m, d) in batches of exactly ``rows`` rows, on all cores; (m, ...).
+
+    A fixed number of rows needs one compilation only.
+    """
     padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % rows, axis=0)])
     chunks = [padded[i : i + rows] for i in range(0, len(padded), rows)]
     parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))

@@ -15,7 +15,6 @@ from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.profiles import DROP, identified, profile, profile_tables
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
-from capsule_id.physics.batches import in_batches
 from tests.cli_tools import small_rig
 
 HEAD = (
@@ -66,7 +65,7 @@ def test_a_profile_is_the_ridge_of_a_grid(tmp_path: Path) -> None:
         points = np.empty((len(across), 2))
         points[:, i], points[:, other] = value, across
         own = target.priors.at(slice(None), np).terms(points[0], target.theta(points[0]), np)[i]
-        heights.append(in_batches(density_of(target), points).max() - own)
+        heights.append(density_of(target)(points).max() - own)
     np.testing.assert_allclose(found["profile"], np.array(heights) - max(heights), atol=2e-4)
     # It is no parabola: with few tilts the scatter grows with the distance.
     assert np.abs(found["profile"] - found["curvature"]).max() > 0.1

@@ -7,7 +7,7 @@ import pytest
 
 from capsule_id.errors import InputError
 from capsule_id.inference.curvature import directions, hessian, jacobian, require_width
-from capsule_id.physics.batches import BATCH, in_batches
+from capsule_id.physics.batches import in_batches
 from capsule_id.precision import require_float64
 
 require_float64()
@@ -89,8 +89,8 @@ def test_batches_have_one_shape() -> None:
         return np.sum(points, axis=1)
 
     points = np.arange(3.0 * 70).reshape(70, 3)
-    np.testing.assert_array_equal(in_batches(function, points), np.sum(points, axis=1))
-    assert shapes == [BATCH] * 3
+    np.testing.assert_array_equal(in_batches(function, points, 32), np.sum(points, axis=1))
+    assert shapes == [32] * 3
 
 
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])

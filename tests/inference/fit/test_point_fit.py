@@ -8,6 +8,7 @@ from scipy import optimize
 
 from capsule_id.api import read_rig
 from capsule_id.experiments.kind import make_experiments
+from capsule_id.inference import marginal
 from capsule_id.inference import point_fit as point_module
 from capsule_id.inference.checks.posterior import check_starts
 from capsule_id.inference.marginal import density_of
@@ -55,9 +56,11 @@ def test_one_difference_for_all_scatters_leads_to_the_same_maximum(
     twin: LogPosterior, fit: PointFit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As of more than a hundred parameters. From the start alone: it is far from the maximum in every scatter."""
-    rows, batches = [], point_module.in_batches
+    rows, batches = [], marginal.in_batches
     monkeypatch.setattr(point_module, "MANY", 0)
-    monkeypatch.setattr(point_module, "in_batches", lambda f, points: (rows.append(len(points)), batches(f, points))[1])
+    monkeypatch.setattr(
+        marginal, "in_batches", lambda f, points, n: (rows.append(len(points)), batches(f, points, n))[1]
+    )
     again = point_fit(twin, 5, 1)
     scatters = int(np.sum(twin.integrated))
     assert scatters > 3

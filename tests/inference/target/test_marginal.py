@@ -19,7 +19,6 @@ from capsule_id.inference.marginal import HEAVY, MarginalPosterior, conditional,
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
-from capsule_id.physics.batches import BATCH
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.stub import log_posterior
@@ -203,7 +202,7 @@ def test_restored_scatters_follow_their_conditional_density(marginal: MarginalPo
 
 def test_the_density_of_the_fit_is_the_plain_one_and_compiles_nothing(marginal: MarginalPosterior) -> None:
     """In batches as large as the sampler's the program of the integrated posterior serves."""
-    target, v = marginal.target, walkers(marginal, BATCH)
+    target, v = marginal.target, walkers(marginal, marginal.rows)
     u, density = marginal.restore(v, 5)[0], density_of(target)
     programs = conditional._cache_size()
     found = density(u)
