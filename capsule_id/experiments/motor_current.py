@@ -73,3 +73,4 @@ class MotorCurrent(Line):
     """Force against current: F = F0 + K I."""
 
     x_name, reading, symbol = "current", "force", "K"
+    from_origin = True

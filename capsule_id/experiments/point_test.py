@@ -218,6 +218,14 @@ LINE_MESSAGES = {
             "({p:p}), so {name} depends on where it is read. Use the part of the range that the runs use."
         ),
     ),
+    "lines.origin": Message(
+        "linearity",
+        warn=(
+            "the line misses the origin by {intercept:.2g} {unit} ({p:p}), and a parabola through the origin fits better: "
+            "{name} is {at_origin:.4g} {slope_unit} at small {x}, or {slope:.4g} {slope_unit} with a wrong zero. Add rows at "
+            "small {x}, or leave out the rows beyond the {x} of the runs."
+        ),
+    ),
     "lines.replicates": Message(
         "repeated readings",
         ok="the means of repeated readings lie on {number:# calibration line}",
@@ -349,10 +357,18 @@ def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
             facts = {"name": e.slope.name, "slope": slope, "unit": e.slope.unit, "x": e.x_name, "y": e.reading}
             findings.append(Finding("lines.rise", "fail", facts, e.label))
             continue
-        bend, p = curvature_test(e, theta, left_out)
+        keep = np.setdiff1d(np.arange(e.n), left_out)
+        readings = e.x[keep], e.observed[keep], e.misfit(theta).sd[keep]
+        bend, p = curvature_test(*readings, e.scale_known)
         if p * len(lines) < LEVEL:
             facts = {"name": e.slope.name, "departure": bend, "p": p}
             findings.append(Finding("lines.straight", "fail", facts, e.label))
+            continue
+        intercept, p, at_origin = origin_test(*readings, e.scale_known)
+        if e.from_origin and at_origin is not None and p * len(lines) < LEVEL:
+            facts = {"name": e.slope.name, "slope": slope, "at_origin": at_origin, "slope_unit": e.slope.unit}
+            facts |= {"intercept": intercept, "unit": e.unit_of_y, "x": e.x_name, "p": p}
+            findings.append(Finding("lines.origin", "warn", facts, e.label, (e.slope.name,)))
     return findings or [Finding("lines.straight", "ok", {"number": len(lines)})]
 
 
@@ -370,19 +386,34 @@ def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
     return findings
 
 
-def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int]) -> tuple[float, float]:
-    """Test a calibration line for curvature: relative deviation of the best parabola at mid range, and p-value."""
-    misfit = line.misfit(theta)
-    keep = np.setdiff1d(np.arange(line.n), left_out)
-    x, sd = line.x[keep], misfit.sd[keep]
+def curvature_test(x: np.ndarray, y: np.ndarray, sd: np.ndarray, scale_known: bool) -> tuple[float, float]:
+    """Test readings y (n,) with errors ``sd`` for curvature: relative deviation of the best parabola at mid range, p-value."""
     z = (x - np.mean(x)) / (np.ptp(x) or 1.0)
-    if len(keep) < 4 or len(np.unique(np.round(z, 9))) < 3:
+    if len(x) < 4 or len(np.unique(np.round(z, 9))) < 3:
         return 0.0, 1.0
-    variances = "unscaled" if line.scale_known else True
-    coefficients, covariance = np.polyfit(z, line.observed[keep], 2, w=1.0 / sd, cov=variances)
-    score = abs(coefficients[0]) / np.sqrt(max(covariance[0, 0], 1e-300))
-    p = 2.0 * (stats.norm.sf(score) if line.scale_known else stats.t.sf(score, len(keep) - 3))
-    return float(coefficients[0] * 0.25 / abs(coefficients[1])), float(p)
+    coefficients, covariance = np.polyfit(z, y, 2, w=1.0 / sd, cov="unscaled" if scale_known else True)
+    p = _p_of(coefficients[0], covariance[0, 0], np.inf if scale_known else len(x) - 3)
+    return float(coefficients[0] * 0.25 / abs(coefficients[1])), p
+
+
+def origin_test(x: np.ndarray, y: np.ndarray, sd: np.ndarray, scale_known: bool) -> tuple[float, float, float | None]:
+    """Test readings y (n,) with errors ``sd`` for a line that misses the origin: its intercept, and p-value.
+
+    Also return the slope at the origin of a parabola through it, where that fits better than the line.
+    """
+    if len(x) < 4:
+        return 0.0, 1.0, None
+    line, covariance = np.polyfit(x, y, 1, w=1.0 / sd, cov="unscaled")
+    parabola = np.linalg.lstsq(np.column_stack([x, x**2]) / sd[:, None], y / sd)[0]
+    misfits = [np.sum(((y - np.polyval(own, x)) / sd) ** 2) for own in (line, [*parabola[::-1], 0.0])]
+    freedom = np.inf if scale_known else len(x) - 2
+    p = _p_of(line[1], covariance[1, 1] * (1.0 if scale_known else min(misfits) / freedom), freedom)
+    return float(line[1]), p, float(parabola[0]) if misfits[1] < misfits[0] else None
+
+
+def _p_of(value: float, variance: float, freedom: float) -> float:
+    """Two-sided p-value of an estimate whose true value is 0."""
+    return 2.0 * float(stats.t.sf(abs(value) / np.sqrt(max(variance, 1e-300)), freedom))
 
 
 def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
@@ -427,8 +458,9 @@ class Line(PointTest):
     #: Column of x, and symbol of the slope.
     x_name: ClassVar[str]
     symbol: ClassVar[str]
-    #: SI unit of y.
+    #: SI unit of y, and whether y is 0 where x is 0.
     unit_of_y: ClassVar[str] = "N"
+    from_origin: ClassVar[bool] = False
     relative = False
     estimates_may_be_negative = True
     checks = (check_linearity, check_replicates, check_scatter)

@@ -420,6 +420,7 @@ QUESTIONS: Mapping[str, str] = {
         "Is the calibration line straight? "
         "It bends by {departure:.1%} of the range ({p:p}), limit p = 0.002 over all lines."
     ),
+    "lines.origin": "Does the line pass through the origin? It misses it by {intercept:.2g} {unit} ({p:p}), limit p = 0.002.",
     "lines.replicates": (
         "Do the means of repeated readings lie on the line? "
         "{deviation:.1f} sd of a reading off ({p:p}), limit p = 0.002."

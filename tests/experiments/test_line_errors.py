@@ -1,5 +1,7 @@
 """Errors in both columns of a calibration line: the slope must not be drawn to ordinary least squares."""
 
+from types import SimpleNamespace
+
 import bench
 import numpy as np
 import pytest
@@ -7,7 +9,9 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 import capsule_id as cid
+from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.motor_current import MotorCurrent
+from capsule_id.experiments.point_test import check_linearity, origin_test
 from capsule_id.experiments.support_spring import SupportSpring
 from capsule_id.inference.checks.settings import outliers
 
@@ -68,6 +72,37 @@ def test_deming_regression_by_hand() -> None:
     found = minimize_scalar(objective, bounds=(1.0, 3.0), method="bounded", options={"xatol": 1e-9})
     # The intercept's prior is wide, not flat: it moves the slope by about (noise / prior width)^2.
     assert found.x == pytest.approx(deming, rel=1e-5)
+
+
+MOTOR = np.linspace(0.5, 4.0, 8)
+
+
+def doubtful(force: np.ndarray, scale_known: bool) -> float:
+    """Share of 400 noisy replicates of a motor's readings whose zero, or straightness, is in doubt at the level 0.002."""
+    rng, sd, count = np.random.default_rng(7), np.full(8, 0.04), 0
+    for _ in range(400):
+        y = force + sd * rng.standard_normal(8)
+        _, p, at_origin = origin_test(MOTOR, y, sd, scale_known)
+        count += at_origin is not None and p < LEVEL
+        assert at_origin is None or scale_known or 0.8 * K < at_origin < 1.2 * K
+    return count / 400
+
+
+@pytest.mark.parametrize("scale_known", [True, False])
+def test_a_motor_that_saturates_is_told_from_a_wrong_zero(scale_known: bool) -> None:
+    """Negative controls: a straight line, and one that begins at 0.1 A, whose slope is K."""
+    assert doubtful(K * 9.0 * np.tanh(MOTOR / 9.0), scale_known) > (0.9 if scale_known else 0.4)
+    assert doubtful(K * MOTOR, scale_known) < 0.01
+    assert doubtful(K * (MOTOR - 0.1), scale_known) < 0.06
+
+
+@pytest.mark.parametrize(("force", "codes"), [(18.0 * np.tanh(MOTOR / 9.0), ["lines.origin"]), (K * MOTOR, [])])
+def test_the_slope_of_a_motor_that_saturates_is_not_judged(force: np.ndarray, codes: list[str]) -> None:
+    """Readings without noise, whose bend of 3 sd alone is no finding."""
+    columns = [bench.column("force", force, 0.055), bench.column("current", MOTOR, 0.005)]
+    line = MotorCurrent(table := bench.table("motor_current", columns), bench.rig(table))
+    found = check_linearity([line], SimpleNamespace(values={"K": line.ordinary_line()[0]}, flagged={}))
+    assert [(f.code, f.parameters) for f in found if f.level != "ok"] == [(code, ("K",)) for code in codes]
 
 
 @pytest.mark.parametrize(("reading", "struck"), [(0.15, False), (0.30, True)])
