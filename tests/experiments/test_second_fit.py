@@ -1,7 +1,9 @@
 """The second fit of a free decay: it finds what the record demands, keeps what is stated, and its lines state it."""
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,10 +14,11 @@ from scipy.signal import lfilter
 import capsule_id as cid
 from capsule_id import cli
 from capsule_id.experiments.base import refit
-from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_found_forces
 from capsule_id.experiments.free_vibration.lint import MESSAGES, lint_decay
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.experiments.free_vibration.readings import DecayModel
+from capsule_id.experiments.free_vibration.record import Screened
 from capsule_id.experiments.free_vibration.second_fit import (
     BIC_MARGIN,
     Ranking,
@@ -196,6 +199,19 @@ def test_the_lines_of_the_finding_state_the_quoted_model() -> None:
     own = record(0.0, DRY, **{**stated, "damping": tuple(stated["damping"])})
     assert own.model == second.model
     assert second_models([own]) == ([own], [])
+
+
+@pytest.mark.parametrize("step", [4e-5, 1e-5])
+def test_a_force_found_in_coarse_levels_is_not_judged(step: float) -> None:
+    """Readings on levels that stand four times their noise apart. Negative control: levels as far apart as the noise."""
+    forces = {"k1": bench.K1, "c": C, "m1": bench.M1, **DRY}
+    x = np.asarray(decay(TIME, forces, RELEASE, 0.0, 30).x_rel) + NOISE * np.random.default_rng(3).standard_normal(250)
+    columns = [bench.column("time", TIME), bench.column("x_rel", np.round(x / step) * step)]
+    e = FreeVibration(table := bench.table("free_vibration", columns, "decay"), bench.rig(table))
+    e = e.with_model(replace(e.model, damping=("dry",)), Screened(0.0, {}, {}, NOISE, np.zeros(250)))
+    draws = [{"F_dry": DRY["F_dry"] * (1.0 + 0.1 * np.sin(i))} for i in range(20)]
+    found = check_found_forces([e], SimpleNamespace(values=draws[0], draws=draws, flagged={}))
+    assert [f.parameters for f in found if f.code == "decays.coarse"] == [("F_dry", "c")] * (step == 4e-5)
 
 
 @pytest.mark.full

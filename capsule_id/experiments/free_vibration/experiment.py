@@ -10,7 +10,7 @@ import pandas as pd
 from scipy import ndimage, stats
 
 from capsule_id.experiments.base import LEVEL, Check, Fitted, Start, ValuesBySymbol, refit
-from capsule_id.experiments.free_vibration.decrement import equilibrium
+from capsule_id.experiments.free_vibration.decrement import equilibrium, viscous_fit
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
     check_held,
@@ -37,6 +37,8 @@ from capsule_id.views import Facts, Finding, Level, ResultTable
 
 #: Joint sds apart from which halves of a decay disagree or a force is seen, and from which that fails.
 DISAGREE, FAIL = 3.0, 4.0
+#: Rounding errors are no noise where all noise is below this share of the distance of levels; rounding alone is 0.29 of it.
+COARSE = 0.42
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
 INTERVALS, READINGS_PER_INTERVAL = 12, 5
 #: Largest part of a drift that is as fast as the motion, relative to the motion.
@@ -150,7 +152,10 @@ def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
 
 
 def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
-    """Check that the forces that a second fit has chosen, and no setting states, are far from 0 in the sample."""
+    """Check the forces that a second fit has chosen, and no setting states.
+
+    They are far from 0 in the sample, and no rounding error of coarse levels stands in their place.
+    """
     found = {symbol: e for e in records if e.replaced for symbol in e.model.symbols} if fit.draws else {}
     draws = {symbol: np.array([draw[symbol] for draw in fit.draws]) for symbol in found}
     z = {symbol: float(abs(np.mean(values)) / np.std(values)) for symbol, values in draws.items()}
@@ -164,7 +169,18 @@ def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Find
         )
         for symbol, e in found.items()
         if z[symbol] < DISAGREE
+    ] + [
+        Finding("decays.coarse", "warn", {"label": e.label, "name": symbol, **facts}, e.label, (symbol, "c"))
+        for symbol, e in found.items()
+        if (facts := coarse_levels(e))["share"] < COARSE
     ]
+
+
+def coarse_levels(e: DecayRecord) -> Facts:
+    """Distance of the levels of a record, and its noise as a share of that, rounding included; inf where none repeat."""
+    (time, values), column = e.whole, e.column
+    step, noise = reading_step(values), float(np.std(viscous_fit(time, values).left))
+    return {"step": step * column.to_display, "unit": column.unit, "share": noise / step if step > 0.0 else np.inf}
 
 
 def drift(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:

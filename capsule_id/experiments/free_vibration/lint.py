@@ -574,6 +574,13 @@ MESSAGES = {
             "Record more periods with less noise, or state the damping and the stiffness in its entry."
         ),
     ),
+    "decays.coarse": Message(
+        "further forces of a decay",
+        warn=(
+            "{label}: readings stand on levels {step:.3g} {unit} apart, and all noise is {share:.2f} of that. Rounding errors "
+            "can then look like a force, so {name} and c are not judged. Record with a finer range, or a larger release."
+        ),
+    ),
     "decays.zero": Message(
         "zero of a decay",
         ok="{labels}: no jump of the sensor's zero stands out where the rod turns",
