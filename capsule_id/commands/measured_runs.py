@@ -8,14 +8,13 @@ from capsule_id.experiments.forced_run.declaration import RunSettings
 from capsule_id.experiments.kind import rough_values
 from capsule_id.parameters import SWEPT
 from capsule_id.records.motion import measured_motion
-from capsule_id.records.tones import recorded_drive, stated_gap, stated_Omega
+from capsule_id.records.tones import VISIBLE, recorded_drive, stated_gap, stated_Omega
 from capsule_id.report.figures.sweeps import MeasuredPoint
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import counted
 
-#: A setting agrees with the diagram within this relative difference, or within this many of its own sds.
+#: A setting agrees with the diagram within this relative difference, or within ``VISIBLE`` of its own sds.
 RELATIVE_TOLERANCE: Mapping[str, float] = dict.fromkeys(("k2", "G", "P_d"), 0.05) | {"Omega": 0.005}
-TOLERANCE_SDS = 3.0
 
 
 def overlay(
@@ -35,19 +34,19 @@ def overlay(
     fitted : fitted values by name (K, k2[<spring>]); defaults are the paper's estimate, then the median of the prior
     spring : its name, if the k2 of the diagram was chosen by name; None compares stiffnesses
 
-    A run agrees if k2, G, P_d and Omega lie within ``RELATIVE_TOLERANCE`` or ``TOLERANCE_SDS`` sds; the swept one is free.
+    A run agrees if k2, G, P_d and Omega lie within ``RELATIVE_TOLERANCE`` or ``VISIBLE`` sds; the swept one is free.
     P_d is the stated one, else K times the amplitude of the current.
     """
     estimate = rough_values(rig)
 
     def known(name: str) -> Quantity:
-        """The fitted value, the paper's estimate, or the stated prior: TOLERANCE_SDS sds are its 95 % range."""
+        """The fitted value, the paper's estimate, or the stated prior: VISIBLE sds are its 95 % range."""
         value, measured = (fitted[name], True) if name in fitted else estimate(name)
         prior = rig.priors.get(name)
         if measured or prior is None or prior.kind != "lognormal":
             # A default prior (factor 1000) is too broad for a comparison.
             return Quantity(value if measured else np.nan)
-        return Quantity(value, value * float(np.log(prior.spread)) / TOLERANCE_SDS)
+        return Quantity(value, value * float(np.log(prior.spread)) / VISIBLE)
 
     motions, left_out = [], []
     for table in rig.tables:
@@ -85,7 +84,7 @@ def _point_or_reason(
             continue
         if np.isnan(quantity.value):
             return f"{name} is neither fitted nor stated"
-        allowed = max(RELATIVE_TOLERANCE[name] * abs(values[name]), TOLERANCE_SDS * quantity.sd)
+        allowed = max(RELATIVE_TOLERANCE[name] * abs(values[name]), VISIBLE * quantity.sd)
         if name != swept and abs(quantity.value - values[name]) > allowed:
             return f"{name} = {quantity.value:.4g}, not {values[name]:.4g} {SWEPT[name].unit}"
     value = settings[swept].value / (2.0 * np.pi if over == "f" else 1.0)

@@ -13,7 +13,6 @@ from scipy.stats import norm
 from capsule_id.errors import InputError
 from capsule_id.records.periods import (
     DECIDED,
-    VISIBLE,
     Repeat,
     find_period,
     first_true,
@@ -23,6 +22,7 @@ from capsule_id.records.periods import (
 )
 from capsule_id.records.tones import (
     BEYOND_CHANCE,
+    VISIBLE,
     Harmonic,
     fit_harmonic,
     recorded_drive,

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.special import logsumexp, softmax
 
-from capsule_id.records.tones import noise_level
+from capsule_id.records.tones import VISIBLE, noise_level
 from capsule_id.rig.filters import Record
 
 # fold: Folds a periodic record onto one period; the samples of each period lie between those of the others.
@@ -110,8 +110,6 @@ MOST_BANDS = 4
 LARGEST_HIDDEN = APERIODIC_SCATTER[0]
 #: Correlations of the scatter of successive cycles.
 CORRELATIONS = 0.6 * np.linspace(-1.0, 1.0, 5)
-#: Standard errors of a variance above which what it exceeds is visible.
-VISIBLE = 3.0
 _HIGHEST_DEGREE = 16  # of the polynomial over a cycle; a high degree on few samples amplifies their noise
 _GRID = 25  # standard deviations per range
 _DIFFERENCE_ORDER = 6  # of the differences for the noise level; the motion vanishes in them

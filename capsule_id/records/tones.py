@@ -64,9 +64,9 @@ def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
 NORMAL_QUARTILE = float(stats.halfnorm.median())
 #: Order of the differences that remove a well-sampled decay.
 ORDER = 3
-#: Standard deviations, or standard errors, that a single value exceeds by chance once in 16,000 times, and that no sample
-#: of a long record does: once in 5e8.
-SIGNIFICANT, BEYOND_CHANCE = 4.0, 6.0
+#: Levels of all detectors, in standard deviations or standard errors. A single value exceeds the first by chance once in
+#: 400 times, the second once in 16,000 times, the third once in 5e8 times: no sample of a long record does.
+VISIBLE, SIGNIFICANT, BEYOND_CHANCE = 3.0, 4.0, 6.0
 #: A fit counts as good as the best one if it leaves at most this many times its sum of squares.
 AS_GOOD = 1.5
 #: Part of the energy of a decay before it is all noise.

@@ -31,12 +31,10 @@ from capsule_id.experiments.statistics import further_columns, weighted_mean
 from capsule_id.parameters import parameter
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import sampling
-from capsule_id.records.tones import length_of_motion, other_tone
+from capsule_id.records.tones import SIGNIFICANT, VISIBLE, length_of_motion, other_tone
 from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding, Level, ResultTable
 
-#: Joint sds apart from which halves of a decay disagree or a force is seen, and from which that fails.
-DISAGREE, FAIL = 3.0, 4.0
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
 INTERVALS, READINGS_PER_INTERVAL = 12, 5
 #: Largest part of a drift that is as fast as the motion, relative to the motion.
@@ -121,7 +119,7 @@ def halves(changes: Changes) -> Check:
         name = max(found, key=lambda name: abs(found[name][2]))
         first, second, z, matters = found[name]
         facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
-        level = "ok" if not abs(z) > DISAGREE else "fail" if abs(z) > FAIL and matters else "warn"
+        level = "ok" if not abs(z) > VISIBLE else "fail" if abs(z) > SIGNIFICANT and matters else "warn"
         return {**facts, "model": e.model_name, "stated": e.stated_words}, level
 
     return each("decays.halves", judge)
@@ -163,7 +161,7 @@ def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Find
             (symbol,),
         )
         for symbol, e in found.items()
-        if z[symbol] < DISAGREE
+        if z[symbol] < VISIBLE
     ]
 
 
