@@ -27,7 +27,7 @@ from capsule_id.console import Progress, complain, saved, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
 from capsule_id.output import NEW, PARTIAL, check_parents, replace_files
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, FIG_6, LEAVES, SWEPT
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.units import UnitError, factor_to_si
 from capsule_id.views import counted
@@ -137,7 +137,7 @@ def client_of(scheduler: str | None) -> "Iterator[Client | None]":
 
 
 # Defaults of the options: Table 1, with gap and drive of the paper's Fig. 6.
-FIG_6_DEFAULTS = {**DEFAULTS, "G": 1e-3, "P_d": 4.0, "Omega": 34.56}
+FIG_6_DEFAULTS = {**DEFAULTS, **FIG_6}
 MOST_POINTS = 10_000_000
 
 

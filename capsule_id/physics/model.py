@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, TABLE, Parameter
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, ROUNDING, TABLE, TABLE_1, Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module, is_traced
 from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, Series, downhill, rod_on_capsule
 
@@ -248,8 +248,6 @@ Initial = tuple[NumberOrBatch, NumberOrBatch, NumberOrBatch, NumberOrBatch]
 
 # Bound on the steps of one lane: 348 periods of the busiest reference motion need 45,000.
 MAX_STEPS = 100_000
-# A normal force below this part of the weight is rounding, as on a slope of 90 degrees.
-NORMAL_ROUNDING = 1e-12
 # Leaves of the capsule that a friction law of its own replaces.
 _OWN_FRICTION = frozenset(row.symbol for row in CoulombStribeck.parameters)
 
@@ -280,7 +278,7 @@ class CapsuleParameters:
     mu: NumberOrBatch
     v_s: NumberOrBatch
     G: NumberOrBatch
-    g: NumberOrBatch = 9.81
+    g: NumberOrBatch = TABLE_1["g"]
     k_cubic: NumberOrBatch = 0.0
     c2: NumberOrBatch = 0.0
     k2_back: NumberOrBatch = 0.0
@@ -288,7 +286,7 @@ class CapsuleParameters:
     slope: NumberOrBatch = 0.0
     N0: NumberOrBatch = 0.0
     mu_back: NumberOrBatch | None = None
-    ratio: NumberOrBatch = 0.5
+    ratio: NumberOrBatch = CoulombStribeck.ratio
     viscous: NumberOrBatch = 0.0
     forces: Any = None
 
@@ -344,7 +342,7 @@ def pressed(p: CapsuleParameters, law: FrictionLaw) -> Any:
     if not isinstance(law, CoulombStribeck) or (p.slope is None and p.N0 is None):
         return p.m1 == p.m1
     size = (p.m1 + p.m2) * p.g + abs(0.0 if p.N0 is None else p.N0)
-    return NORMAL_ROUNDING * size < law.N
+    return ROUNDING * size < law.N  # on a slope of 90 degrees rounding is left
 
 
 def _signs() -> str:

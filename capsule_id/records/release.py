@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from capsule_id.records.tones import BEYOND_CHANCE, SIGNIFICANT, frequency_of, noise_level
+from capsule_id.records.tones import BEYOND_CHANCE, FEWEST_IN_PERIOD, SIGNIFICANT, frequency_of, noise_level
 from capsule_id.rig.filters import PIECE, loudest_part
 
 #: Turning points differ by this fraction of the record's range, and by more than noise.
@@ -19,8 +19,8 @@ LEG = 0.3
 STEEP, STEEP_TIME = 0.3, 0.097
 #: Where the leg has passed this fraction of its height, the release is past.
 PAST = 0.8
-#: Samples in a period that suffice; of more, means are taken. Fewest of them, and fewest in a window.
-SAMPLES, FEWEST, WINDOW = 100, 4.0, 28
+#: Samples in a period that suffice; of more, means are taken. Fewest in a window.
+SAMPLES, WINDOW = 100, 28
 #: The motion ends where it stays so close to its last value: fraction of the range; or within the noise.
 STILL = 0.015
 #: Prior sds of dry friction, quadratic damping and a cubic spring, relative to the spring force at the amplitude.
@@ -170,7 +170,7 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
     last = int(np.flatnonzero(sizes >= LEG * np.max(sizes))[-1])
     period, past = _scale(time, values, int(turns[last]), int(turns[last + 1]))
     decay, over = None, float(time[turns[last + 1]])
-    if period >= FEWEST * np.median(np.diff(time)):
+    if period >= FEWEST_IN_PERIOD * np.median(np.diff(time)):
         lengths, first = np.diff(time[turns]), last
         while (
             first

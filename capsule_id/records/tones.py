@@ -67,6 +67,8 @@ ORDER = 3
 #: Levels of all detectors, in standard deviations or standard errors. A single value exceeds the first by chance once in
 #: 400 times, the second once in 16,000 times, the third once in 5e8 times: no sample of a long record does.
 VISIBLE, SIGNIFICANT, BEYOND_CHANCE = 3.0, 4.0, 6.0
+#: Fewest samples in a period of a motion that a record can show.
+FEWEST_IN_PERIOD = 4
 #: A fit counts as good as the best one if it leaves at most this many times its sum of squares.
 AS_GOOD = 1.5
 #: Part of the energy of a decay before it is all noise.

@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import Prior
+from capsule_id.parameters import ROUNDING, Prior
 from capsule_id.views import Finding, counted
 
 
@@ -22,8 +22,6 @@ class Quantity:
     sd: float = 0.0
 
 
-#: Relative difference below which numbers of two programs are the same, and largest rounding error of a converted number.
-SAME, ROUNDING = 1e-9, 1e-12
 #: Fewest samples of a record: six unknowns of a free decay (k1, c, amplitude, phase, offset, noise) and two more.
 SHORTEST_RECORD = 8
 #: A clock that agrees with true time.

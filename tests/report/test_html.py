@@ -149,8 +149,9 @@ def test_the_limits_of_the_questions_are_those_of_the_checks() -> None:
     limits = {
         "sample.maximum": {FARTHEST_MAXIMUM}, "priors.tails": {PRIOR_PULL}, "trials.loads": {ORDER_LEVEL},
         "trials.order": {SMALLEST_CORRELATION, ORDER_LEVEL}, "trials.tables": {ORDER_LEVEL}, "trials.speeds": {ORDER_LEVEL},
-        "bench_and_runs.agree": {AGREEMENT_LEVEL}, "runs.predictable": {LARGEST_GROWTH}, "decays.halves": {SIGNIFICANT, VISIBLE},
-        "friction.variants": {FACTOR}, "starts.agree": {0.0}, "springs.cantilever": {LEVEL, 3.0},
+        "bench_and_runs.agree": {AGREEMENT_LEVEL}, "runs.predictable": {LARGEST_GROWTH},
+        "decays.halves": {SIGNIFICANT, VISIBLE}, "friction.variants": {FACTOR}, "starts.agree": {0.0},
+        "springs.cantilever": {LEVEL, 3.0},
     }  # fmt: skip
     for code, numbers in said.items():
         assert numbers == limits.get(code, {LEVEL} if numbers else set()), code

@@ -39,6 +39,7 @@ from capsule_id.experiments.free_vibration.readings import (
 from capsule_id.experiments.free_vibration.record import DecayRecord, ReadingTimes, Screened, whiten_by_shape
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.experiments.statistics import further_columns, ljung_box, weighted_mean
+from capsule_id.parameters import ROUNDING, SAME
 from capsule_id.physics.batches import pool
 from capsule_id.physics.exact.engine import as_one_function
 from capsule_id.records.tones import NEAR, lasting_tone, noise_level
@@ -125,10 +126,8 @@ def nested_starts(e: DecayRecord) -> list[dict[str, float]]:
 
 #: Largest number of evaluations in a fit.
 EVALUATIONS = 40
-#: Distance of starts from the bounds, and of the start of a term that a nested model lacks.
-INSIDE, ABSENT_TERM = 1e-3, 1e-9
-#: Replaces the effect of an unknown that the record does not depend on.
-UNKNOWN = 1e-12
+#: Distance of starts from the bounds; that of a term that a nested model lacks is ``SAME``.
+INSIDE = 1e-3
 #: Replaces residuals, relative to the scatter of the readings, where the model has no motion.
 UNFIT = 1e3
 #: Starts of a fit with dry friction: rounds of one batch each, and standard deviations of their scaled unknowns (F_dry:
@@ -345,7 +344,7 @@ class Screening:
         first = list(np.clip(starts[:, free], *inside))
         if nested:
             best = min(nested, key=lambda one: one[0].noise)[1]
-            first.append(np.clip(self.start(model, best, absent=True)[free], low + ABSENT_TERM, high - ABSENT_TERM))
+            first.append(np.clip(self.start(model, best, absent=True)[free], low + SAME, high - SAME))
         options: Any = {"jac": lambda z: jacobians[z.tobytes()], "bounds": (low, high), "x_scale": "jac"}
         ends = [least_squares(residuals, one, max_nfev=EVALUATIONS, **options) for one in first]
         found = min(ends, key=lambda end: end.cost)
@@ -392,9 +391,9 @@ class Screening:
         deviance = n * (np.log(2.0 * found.cost * unit**2 / n) + 1.0 + LOG_2PI)
         values = {name: float(value) for name, value in self.theta(z).items()}
         norms = np.linalg.norm(found.jac, axis=0)
-        norms = np.where(norms > 0.0, norms, UNKNOWN)
+        norms = np.where(norms > 0.0, norms, ROUNDING)  # of an unknown that the record does not depend on
         scaled = found.jac / norms
-        variances = np.maximum(np.diag(np.linalg.pinv(scaled.T @ scaled, hermitian=True)), UNKNOWN) / norms**2
+        variances = np.maximum(np.diag(np.linalg.pinv(scaled.T @ scaled, hermitian=True)), ROUNDING) / norms**2
         sd = np.sqrt(variances * 2.0 * found.cost / max(n - unknowns, 1))
         units = {name: self.units[name] if name in LINEAR else values[name] for name in free}
         errors = {name: float(units[name] * own) for name, own in zip(free, sd, strict=True)}
