@@ -15,8 +15,11 @@ import numpy as np
 
 Value = TypeVar("Value")
 
-#: A log-normal prior holds 95 % of its mass within median/factor .. median*factor.
-QUANTILE_975 = NormalDist().inv_cdf(0.975)
+#: Ends of the intervals that are quoted: a log-normal prior holds 95 % of its mass within median/factor .. median*factor.
+ENDS = (0.025, 0.975)
+QUANTILE_975 = NormalDist().inv_cdf(ENDS[1])
+#: Standard deviation of the rounding error of a reading, in steps.
+STEP_SD = float(1.0 / np.sqrt(12.0))
 #: Factor of the prior of a parameter of which nothing is known.
 VAGUE = 1000.0
 #: Relative difference below which numbers of two programs are the same, and largest rounding error of a computed number.

@@ -11,7 +11,7 @@ from scipy.special import logsumexp, softmax
 from scipy.stats import norm
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import STANDING
+from capsule_id.parameters import STANDING, STEP_SD
 from capsule_id.records.periods import (
     DECIDED,
     Repeat,
@@ -324,7 +324,7 @@ def _shortfall(cycle: Cycle) -> Shortfall | None:
     terms = _linear_law_terms(cycle, near)
     shortfall = terms @ law - cycle.acceleration
     # A step that exceeds the motion clear of contact hides the noise: what is left is the rounding.
-    rounding = float(np.min(np.diff(np.unique(cycle.acceleration)))) / np.sqrt(12.0)
+    rounding = float(np.min(np.diff(np.unique(cycle.acceleration)))) * STEP_SD
     sd = max(float(np.std(shortfall[clear])), rounding)
     of_law = sd * np.linalg.norm(np.linalg.solve(triangle.T, (terms / scale).T), axis=0)
     of_terms = cycle.noise_sd * np.hypot(law[1] * near_sd[0], law[2] * near_sd[1])

@@ -49,13 +49,14 @@ CHANGE = 0.1
 REGULAR, ALIKE, LEGS = 0.3, 0.15, 3
 #: A second excitation makes the amplitude this many times as large.
 GROWTH = 1.15
-#: A push moves the rod by this fraction of the range, and takes this many times as long as the free rod takes back.
-SMALLEST_PUSH, PUSHED = 0.05, 1.3
+#: A push moves the rod by this fraction of the range, and amplitudes differ by more than that of the largest one. A push
+#: takes this many times as long as the free rod takes back.
+SMALLEST, PUSHED = 0.05, 1.3
 #: Time constants after which a decay has died out.
 DIED_OUT = 4.0
-#: Between two releases of one record the motion is smaller than this fraction of both amplitudes, and no amplitude is
-#: counted below this fraction of the largest one. The first decay ends where its motion is this many times the smallest.
-BETWEEN, SMALLEST_RELEASE, ENDS = 0.3, 0.05, 1.25
+#: Between two releases of one record the motion is smaller than this fraction of both amplitudes. The first decay ends
+#: where its motion is this many times the smallest.
+BETWEEN, ENDS = 0.3, 1.25
 #: The last part of a pull, relative to the amplitude, where the search for its release begins.
 PULLED = 0.7
 
@@ -143,7 +144,7 @@ def find_releases(time: np.ndarray, values: np.ndarray, displacement: bool = Fal
 
 def _lowest_between(motion: np.ndarray, step: int) -> list[int]:
     """Rows of the smallest motion between two amplitudes, for which every ``step``-th row is looked at."""
-    level = np.log(np.maximum(motion[::step], SMALLEST_RELEASE * np.max(motion))).tolist()
+    level = np.log(np.maximum(motion[::step], SMALLEST * np.max(motion))).tolist()
     top, low, cuts = level[0], 0, list[int]()
     for i, here in enumerate(level):
         if here - level[low] > -np.log(BETWEEN) < top - level[low]:
@@ -221,7 +222,7 @@ def _push(time: np.ndarray, values: np.ndarray, start: float, period: float) -> 
     away = values[:near] - values[min(int(np.searchsorted(time, start + 0.5 * period)), len(values) - 1)]
     top = int(np.argmax(np.abs(away)))
     height = np.sign(away[top]) * (values - values[0])
-    climbs = height[top] > SMALLEST_PUSH * np.ptp(values[row:]) and height[row - 1] > 0.5 * height[top]
+    climbs = height[top] > SMALLEST * np.ptp(values[row:]) and height[row - 1] > 0.5 * height[top]
     if not climbs or time[top] - time[0] > 0.5 * period:
         return start, False
     high = np.flatnonzero(height[: top + 1] < PAST * height[top])[-1]
@@ -268,9 +269,9 @@ def _growth(time: np.ndarray, values: np.ndarray, turns: np.ndarray) -> float | 
     """Time before legs between ``turns`` that grow; None where none does. Two of them grow, and three were lower."""
     sizes = np.abs(np.diff(values[turns]))
     highest = np.max(np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (2, 0), mode="edge"), 3), axis=1)
-    grown = sizes > GROWTH * np.minimum.accumulate(
-        np.concatenate([highest[:1], highest[:-1]])
-    ) + SMALLEST_PUSH * np.max(sizes)
+    grown = sizes > GROWTH * np.minimum.accumulate(np.concatenate([highest[:1], highest[:-1]])) + SMALLEST * np.max(
+        sizes
+    )
     twice = 1 + np.flatnonzero(grown[1:-1] & grown[2:])
     return float(time[turns[twice[0]]]) if len(twice) else None
 

@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import ROUNDING, Prior
+from capsule_id.parameters import ROUNDING, STEP_SD, Prior
 from capsule_id.views import Finding, counted
 
 
@@ -94,7 +94,7 @@ class Column:
     @property
     def reading_sd(self) -> float:
         """Stated error and the rounding error of the reading step, step/sqrt(12), added in quadrature; SI."""
-        return float(np.hypot(self.sd or 0.0, (self.resolution or 0.0) / np.sqrt(12.0)))
+        return float(np.hypot(self.sd or 0.0, (self.resolution or 0.0) * STEP_SD))
 
     @property
     def unstated_step(self) -> float:

@@ -20,6 +20,7 @@ from capsule_id.experiments.forced_run.start_state import RunStart, rough_start,
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
 from capsule_id.experiments.kind import Estimate
 from capsule_id.experiments.statistics import autocorrelation, further_columns, judged
+from capsule_id.parameters import ENDS
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
 from capsule_id.physics.forces import FrictionLaw, downhill, grazing_load, rod_on_capsule
 from capsule_id.physics.model import (
@@ -290,7 +291,7 @@ def _motion_row(run: CapsuleRun, fit: Fitted) -> dict[str, object]:
     if sample is not None:
         error = sd * np.random.default_rng(0).standard_normal((ERRORS, 1))
         velocities = error + np.array([velocity(place) for place in np.asarray(sample.X2)])
-        row["95 % band, mm/s"] = "{:.4g} to {:.4g}".format(*np.quantile(velocities, [0.025, 0.975]))
+        row["95 % band, mm/s"] = "{:.4g} to {:.4g}".format(*np.quantile(velocities, ENDS))
     if found is not None:
         row["mean velocity, record, mm/s"] = f"{1e3 * found.velocity:.4g} ± {sd:.2g}"
     return row

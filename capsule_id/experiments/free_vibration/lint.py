@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.constants import minute
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import decay_frequency
@@ -61,7 +62,7 @@ FEWEST_PERIODS = 2
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
-RATIOS = (("1000 (s and ms)", PREFIX), ("60 (min and s)", 60.0), ("2 pi (rad and cycles)", 2.0 * np.pi))
+RATIOS = (("1000 (s and ms)", PREFIX), ("60 (min and s)", minute), ("2 pi (rad and cycles)", 2.0 * np.pi))
 
 
 def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:

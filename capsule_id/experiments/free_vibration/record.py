@@ -69,7 +69,7 @@ from capsule_id.experiments.free_vibration.readings import (
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
 from capsule_id.experiments.statistics import autocorrelation
-from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.parameters import STEP_SD, Parameter, Prior, parameter
 from capsule_id.records.release import shortened
 from capsule_id.records.tones import VISIBLE, noise_level
 from capsule_id.records.view import FILTER_ORDER
@@ -178,7 +178,7 @@ UNIFORM = 0.6
 LATEST_TURNING_POINT = 0.1
 #: Smallest sd of a reading with white noise, where none is stated, relative to ``width``: that of steps of 18 bits, which
 #: good converters resolve. Without noise k1/m1 would have more digits than covariances and sums of squares hold.
-FINEST = 2.0**-18 / np.sqrt(12.0) / NUISANCE_WIDTH
+FINEST = 2.0**-18 * STEP_SD / NUISANCE_WIDTH
 
 
 @dataclass(frozen=True)

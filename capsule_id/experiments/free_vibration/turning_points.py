@@ -35,7 +35,7 @@ from capsule_id.experiments.free_vibration.record import Decay, DecayAbout, Scre
 from capsule_id.experiments.free_vibration.second_fit import Demanded, force_starts, replaced
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
-from capsule_id.parameters import Prior, parameter
+from capsule_id.parameters import STEP_SD, Prior, parameter
 from capsule_id.records.tones import SIGNIFICANT, VISIBLE
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Facts, Finding, Level
@@ -204,7 +204,7 @@ def check_steps(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding]
         )
         for e in tables
         for name, symbol, told, step in zip(("x_rel", "time"), e.scatters, ("c", "k1"), e.steps, strict=True)
-        if e.local(fit.values)[symbol] < step / np.sqrt(12.0)
+        if e.local(fit.values)[symbol] < step * STEP_SD
     ]
 
 
@@ -314,8 +314,7 @@ class TurningPoints(Decay):
         columns = [table.columns[name] for name in ("x_rel", "time")]
         self.steps = tuple(column.unstated_step for column in columns)
         errors = [
-            float(np.hypot(column.reading_sd, step / np.sqrt(12.0)))
-            for column, step in zip(columns, self.steps, strict=True)
+            float(np.hypot(column.reading_sd, step * STEP_SD)) for column, step in zip(columns, self.steps, strict=True)
         ]
         self.reading_sd, self.time_reading_sd = errors
         self.clock_rate = stated_rate(table)
