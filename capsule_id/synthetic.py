@@ -14,10 +14,10 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, Registry, default_registry
 from capsule_id.output import replace_files
 from capsule_id.parameters import SPRINGS, TABLE, TABLE_1
-from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import friction_law, scaled
 from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import displacement
 from capsule_id.rig.model import Rig
 from capsule_id.rig.toml import NAME_PATTERN
 

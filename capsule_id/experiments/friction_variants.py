@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from scipy import special
-from scipy.optimize import bisect
+from scipy.optimize import root_scalar
 
 from capsule_id.experiments.base import LEVEL, Fitted
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
@@ -205,7 +205,7 @@ def _next_step(value: np.ndarray, largest: float) -> float:
 
     if effective(largest) >= KEPT:
         return largest
-    return max(float(bisect(lambda step: effective(step) - KEPT, 0.0, largest)), SAME)
+    return max(root_scalar(lambda step: effective(step) - KEPT, bracket=(0.0, largest)).root, SAME)
 
 
 def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.constants import kilo
 
 from capsule_id.experiments.kind import Estimate, Kind
 from capsule_id.parameters import TABLE_1
@@ -59,7 +58,7 @@ MASS_ALONE, MOTOR_ALONE, SPRING_ALONE = (0.02, 5.0), (0.3, 40.0), (100.0, 1e5)
 #: the unit of time.
 USUAL_PERIODS, ACCELERATIONS = (2e-3, 20.0), (3e-3, 1e4)
 #: Factor of a wrong prefix, such as m for mm, and largest distance of a ratio from it, in decades, that it explains.
-PREFIX, NEAR_PREFIX = kilo, 0.3
+PREFIX, NEAR_PREFIX = 1.0 / factor_to_si("mm", "m"), 0.3
 
 
 def _slope(x: np.ndarray, y: np.ndarray) -> float:
