@@ -20,13 +20,8 @@ from capsule_id.experiments.free_vibration.hidden_terms import (
 )
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
-from capsule_id.experiments.free_vibration.second_fit import (
-    SHORTEST,
-    Screening,
-    decay_starts,
-    nested_starts,
-    second_models,
-)
+from capsule_id.experiments.free_vibration.screening import Screening, decay_starts, nested_starts
+from capsule_id.experiments.free_vibration.second_fit import SHORTEST, second_models
 from capsule_id.experiments.statistics import further_columns, weighted_mean
 from capsule_id.parameters import parameter
 from capsule_id.records.duplicates import reading_step
