@@ -68,7 +68,6 @@ if TYPE_CHECKING:
         motion_map as motion_map,
     )
     from capsule_id.physics.drives import Pulses as Pulses, RecordedDrive as RecordedDrive, RodMotion as RodMotion
-    from capsule_id.physics.energy import energy_balance as energy_balance
     from capsule_id.physics.model import (
         CapsuleParameters as CapsuleParameters,
         Excitation as Excitation,
@@ -76,7 +75,11 @@ if TYPE_CHECKING:
         Trajectory as Trajectory,
         status_message as status_message,
     )
-    from capsule_id.physics.simulation import simulate as simulate, smoothing_bias as smoothing_bias
+    from capsule_id.physics.simulation import (
+        energy_balance as energy_balance,
+        simulate as simulate,
+        smoothing_bias as smoothing_bias,
+    )
     from capsule_id.physics.smooth.engine import Smoothing as Smoothing
     from capsule_id.synthetic import (
         RobotDesign as RobotDesign,
@@ -93,9 +96,8 @@ _PUBLIC = {
     "motions.response": ("Response", "Settling", "response"),
     "motions.sweep": ("continuation", "diagram", "draws_diagram", "motion_map"),
     "physics.drives": ("Pulses", "RecordedDrive", "RodMotion"),
-    "physics.energy": ("energy_balance",),
     "physics.model": ("CapsuleParameters", "Excitation", "Status", "Trajectory", "status_message"),
-    "physics.simulation": ("simulate", "smoothing_bias"),
+    "physics.simulation": ("energy_balance", "simulate", "smoothing_bias"),
     "physics.smooth.engine": ("Smoothing",),
     "synthetic": ("RobotDesign", "synthesize", "synthesize_robot"),
 }

@@ -15,8 +15,20 @@ import numpy as np
 
 Value = TypeVar("Value")
 
-#: A log-normal prior holds 95 % of its mass within median/factor .. median*factor.
-QUANTILE_975 = NormalDist().inv_cdf(0.975)
+#: Ends of the intervals that are quoted: a log-normal prior holds 95 % of its mass within median/factor .. median*factor.
+ENDS = (0.025, 0.975)
+QUANTILE_975 = NormalDist().inv_cdf(ENDS[1])
+#: Standard deviation of the rounding error of a reading, in steps.
+STEP_SD = float(1.0 / np.sqrt(12.0))
+#: Factor of the prior of a parameter of which nothing is known.
+VAGUE = 1000.0
+#: Relative difference below which numbers of two programs are the same, and largest rounding error of a computed number.
+SAME, ROUNDING = 1e-9, 1e-12
+#: Longest period of a motion that is looked for, excitation periods, and largest advance of a standing capsule in one, m.
+LONGEST_PERIOD, STANDING = 16, 1e-7
+#: Gap and drive of the paper's Fig. 6, and k2 of its springs, SI.
+FIG_6: Mapping[str, float] = {"G": 1e-3, "P_d": 4.0, "Omega": 34.56}
+SPRINGS: Mapping[str, float] = {"soft": 2420.0, "medium": 18960.0, "stiff": 56410.0}
 
 
 @dataclass(frozen=True)
@@ -167,7 +179,7 @@ class Parameter:
         return bound if self.may_be_infinite else (abs(value) < np.inf) & bound
 
 
-def _lognormal(median: float, factor: float) -> Prior:
+def _lognormal(median: float, factor: float = VAGUE) -> Prior:
     return Prior("lognormal", median, factor)
 
 
@@ -181,32 +193,34 @@ def scatter(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | Non
     return Parameter(symbol, unit, meaning, latex, prior, physical=False, scatter=True)
 
 
+#: Prior of a coefficient of static friction, in either direction.
+MU = _lognormal(0.4, 5.0)
 TABLE: Mapping[str, Parameter] = {
     row.symbol: row
     for row in (
         Parameter("m1", "kg", "mass of the rod", "m_1", leaf="capsule", table_1=0.110),
         Parameter("m2", "kg", "mass of the capsule", "m_2", leaf="capsule", table_1=0.530),
         Parameter(
-            "k1", "N/m", "stiffness between rod and capsule", "k_1", _lognormal(1500.0, 1000.0),
+            "k1", "N/m", "stiffness between rod and capsule", "k_1", _lognormal(1500.0),
             leaf="capsule", sign="not negative", table_1=1420.0,
         ),
         Parameter(
-            "k2", "N/m", "stiffness of the support spring", "k_2", _lognormal(20e3, 1000.0),
+            "k2", "N/m", "stiffness of the support spring", "k_2", _lognormal(20e3),
             leaf="capsule", sign="not negative",
         ),
         Parameter(
-            "c", "N s/m", "viscous damping between rod and capsule", "c", _lognormal(4.0, 1000.0),
+            "c", "N s/m", "viscous damping between rod and capsule", "c", _lognormal(4.0),
             leaf="capsule", sign="not negative", table_1=3.89,
         ),
         Parameter(
-            "mu", "1", "static friction coefficient, eq. (1)", r"\mu", _lognormal(0.4, 5.0),
+            "mu", "1", "static friction coefficient, eq. (1)", r"\mu", MU,
             leaf="capsule", sign="not negative", table_1=0.66,
         ),
         Parameter(
             "v_s", "m/s", "Stribeck velocity, eq. (1)", "v_s", _lognormal(0.3, 10.0), leaf="capsule", table_1=0.30
         ),
         Parameter(
-            "mu_back", "1", "static friction coefficient of backward sliding", r"\mu_-", _lognormal(0.4, 5.0),
+            "mu_back", "1", "static friction coefficient of backward sliding", r"\mu_-", MU,
             leaf="capsule", sign="not negative", default="mu",
         ),
         Parameter(
@@ -269,9 +283,9 @@ TABLE: Mapping[str, Parameter] = {
             "lag", "s", "lag of the force of pulses", r"\tau", _lognormal(0.01, 10.0),
             leaf="drive", sign="not negative", default=0.0,
         ),
-        Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0), table_1=2.0),
-        Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
-        Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),
+        Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0), table_1=2.0),
+        Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1)),
+        Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0)),
         nuisance("x_start", "m", "x_rel at the start of a record", "x_0"),
         nuisance("y_start", "m/s", "rate of x_rel at the start of a record", "y_0"),
         nuisance("clock_drift", "1", "drift of the clock of a record", r"\delta_\mathrm{clock}"),

@@ -13,18 +13,18 @@ import pandas as pd
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, Registry, default_registry
 from capsule_id.output import replace_files
-from capsule_id.parameters import TABLE, TABLE_1
-from capsule_id.physics.displacement import displacement
+from capsule_id.parameters import SPRINGS, TABLE, TABLE_1
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import friction_law, scaled
 from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import displacement
 from capsule_id.rig.model import Rig
 from capsule_id.rig.toml import NAME_PATTERN
 
 #: Table 1 and three springs of the paper, SI by name.
 PAPER: Mapping[str, float] = {
     **{name: TABLE_1[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "K", "g")},
-    **{"k2[soft]": 2420.0, "k2[medium]": 18960.0, "k2[stiff]": 56410.0},
+    **{f"k2[{spring}]": k2 for spring, k2 in SPRINGS.items()},
 }
 
 

@@ -1,6 +1,8 @@
 """``capsule-id predict RESULT SETTINGS``: displacements at new settings, from a result with a progression."""
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
 
 from capsule_id.commands import NO_CACHE, PATH
 from capsule_id.commands.compilation import prepare_jax
@@ -43,11 +45,22 @@ def run(args: argparse.Namespace) -> int:
     if args.figure is not None:
         with own_style():
             written.append(("--figure", args.figure, png(side_by_side(made.panels))))
+    write_new_files(written, f": {counted(len(made.table), 'setting')}")
+    return 0
+
+
+def write_new_files(written: Sequence[tuple[str, Path, bytes]], about: str = "") -> None:
+    """Write option, file and content of ``--out``, then of ``--figure``, and print the names; ``about`` the first.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
     for option, file, content in written:
         with refusing(f"{option} must be writable", "name another file", file):
             replace_file(file, content)
-        say(f"wrote {file}: {counted(len(made.table), 'setting')}" if option == "--out" else f"wrote {file}")
-    return 0
+        say(f"wrote {file}{about if option == '--out' else ''}")
 
 
 def check_new_files(args: argparse.Namespace) -> None:

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 from capsule_id.commands import NO_CACHE, PATH, QUIET
 from capsule_id.commands.compilation import prepare_jax
-from capsule_id.commands.predict import check_new_files
+from capsule_id.commands.predict import check_new_files, write_new_files
 from capsule_id.commands.simulate import number, whole_number
 from capsule_id.console import Progress, say
-from capsule_id.errors import InputError, check_seed, refusing
-from capsule_id.output import replace_file
+from capsule_id.errors import InputError, check_seed
 from capsule_id.parameters import LEAVES
 from capsule_id.views import counted
 
@@ -93,10 +92,7 @@ def run(args: argparse.Namespace) -> int:
                 mark(figure, "synthetic data")
             written.append(("--figure", args.figure, png(figure)))
     say(_summary(found))
-    for option, file, content in written:
-        with refusing(f"{option} must be writable", "name another file", file):
-            replace_file(file, content)
-        say(f"wrote {file}")
+    write_new_files(written)
     return 0 if result.clean else 3
 
 

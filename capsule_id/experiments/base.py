@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.experiments.statistics import ljung_box
-from capsule_id.parameters import Parameter, Prior, is_stated, parameter
+from capsule_id.parameters import ENDS, Parameter, Prior, is_stated, parameter
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.precision import require_float64
 from capsule_id.records.view import RunRecord
@@ -388,7 +388,7 @@ def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Equal-tailed 95 % band over the first axis of ``values`` (m, n); (None, None) where m is 0."""
     if len(values) == 0:
         return None, None
-    lower, upper = np.quantile(values, [0.025, 0.975], axis=0)
+    lower, upper = np.quantile(values, ENDS, axis=0)
     return lower, upper
 
 

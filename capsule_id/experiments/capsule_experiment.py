@@ -17,7 +17,7 @@ from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.record import DecayRecord
-from capsule_id.experiments.free_vibration.second_fit import decay_starts
+from capsule_id.experiments.free_vibration.screening import decay_starts
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
     FrictionModel,

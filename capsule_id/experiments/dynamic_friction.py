@@ -27,6 +27,7 @@ from capsule_id.experiments.lint import lint_reading_errors
 from capsule_id.parameters import INSTRUMENT_ERRORS, scatter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.forces import FrictionLaw, normal_force, slide_distance
+from capsule_id.records.tones import VISIBLE
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry
 from capsule_id.rig.toml import POSITIVE
@@ -37,8 +38,8 @@ from capsule_id.views import Finding, Message
 
 #: Smallest power of the speed in the distance; constant friction gives 2, swapped columns 1/2.
 SMALLEST_POWER = 1.0
-#: Standard errors by which the power must lie below; smallest ratio of the speeds, and fewest pushes, that show it.
-STANDARD_ERRORS, SPEED_RATIO, FEWEST_PUSHES = 3.0, 1.5, 3
+#: Smallest ratio of the speeds, and fewest pushes, that show it.
+SPEED_RATIO, FEWEST_PUSHES = 1.5, 3
 
 
 def lint_pushes(table: Table[Any], rig: Rig) -> Iterable[Finding]:
@@ -48,7 +49,7 @@ def lint_pushes(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         return
     (power, _), covariance = np.polyfit(speed, distance, 1, cov=True)
     error = np.sqrt(covariance[0, 0])
-    if power + STANDARD_ERRORS * error < SMALLEST_POWER:
+    if power + VISIBLE * error < SMALLEST_POWER:
         facts = {"file": table.file, "power": float(power), "error": float(error)}
         yield Finding("pushes.power", "fail", facts, table.label)
 

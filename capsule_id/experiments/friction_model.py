@@ -10,7 +10,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.parameters import INSTRUMENT_ERRORS, Name, Parameter, Prior, parameter
+from capsule_id.parameters import INSTRUMENT_ERRORS, SAME, Name, Parameter, Prior, parameter
 from capsule_id.physics.forces import CoulombStribeck, Force, FrictionLaw, normal_force, scaled
 from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 
@@ -23,8 +23,6 @@ NORMAL_FORCE, GAP = "N", "G"
 CONSTANT = {"ratio": 1.0, "v_s": 1.0}
 #: Prior draws at which a parameter may change the break-away force.
 PRIOR_DRAWS = 64
-#: Relative changes of the break-away force below this are rounding.
-ROUNDING = 1e-9
 
 
 @jax.tree_util.register_dataclass
@@ -155,7 +153,7 @@ class FrictionModel:
             other = self._at({**draws, row.symbol: np.roll(draws[row.symbol], 1)}, 1.0)
             change = np.abs(np.asarray(other.forward(still)) - force)
             # A force that is not finite does not show that the parameter has no effect.
-            return not bool(np.all(change <= ROUNDING * np.abs(force)))
+            return not bool(np.all(change <= SAME * np.abs(force)))
 
         return tuple(row for row in self.parameters if matters(row))
 

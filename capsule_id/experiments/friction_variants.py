@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 from scipy import special
+from scipy.optimize import root_scalar
 
 from capsule_id.experiments.base import LEVEL, Fitted
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.experiments.statistics import of_neighbours, permutation_p
-from capsule_id.parameters import QUANTILE_975, Parameter, Prior
+from capsule_id.parameters import QUANTILE_975, SAME, Parameter, Prior
 from capsule_id.physics.forces import CoulombStribeck
 from capsule_id.views import Finding
 
@@ -202,13 +203,9 @@ def _next_step(value: np.ndarray, largest: float) -> float:
         weight = np.exp(step * (value - np.max(value)))
         return float(np.sum(weight) ** 2 / np.sum(weight**2) / len(value))
 
-    low, high = 0.0, largest
-    if effective(high) >= KEPT:
-        return high
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if effective(middle) >= KEPT else (low, middle)
-    return max(low, 1e-9)
+    if effective(largest) >= KEPT:
+        return largest
+    return max(root_scalar(lambda step: effective(step) - KEPT, bracket=(0.0, largest)).root, SAME)
 
 
 def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:

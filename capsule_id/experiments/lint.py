@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.experiments.kind import Estimate, Kind
+from capsule_id.parameters import TABLE_1
 from capsule_id.records.duplicates import Readings, repeated_blocks
 from capsule_id.records.faults import (
     clipped_samples,
@@ -57,7 +58,7 @@ MASS_ALONE, MOTOR_ALONE, SPRING_ALONE = (0.02, 5.0), (0.3, 40.0), (100.0, 1e5)
 #: the unit of time.
 USUAL_PERIODS, ACCELERATIONS = (2e-3, 20.0), (3e-3, 1e4)
 #: Factor of a wrong prefix, such as m for mm, and largest distance of a ratio from it, in decades, that it explains.
-PREFIX, NEAR_PREFIX = 1e3, 0.3
+PREFIX, NEAR_PREFIX = 1.0 / factor_to_si("mm", "m"), 0.3
 
 
 def _slope(x: np.ndarray, y: np.ndarray) -> float:
@@ -72,7 +73,7 @@ RELATIONS = (
         ("speed", "distance"),
         "speed^2/(2 g distance)",
         "1",
-        lambda x, y: float(np.median(x**2 / (19.62 * y))),
+        lambda x, y: float(np.median(x**2 / (2.0 * TABLE_1["g"] * y))),
         (0.01, 20.0),
         (0.01, 20.0),
     ),

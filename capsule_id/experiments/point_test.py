@@ -39,7 +39,7 @@ from capsule_id.experiments.friction_model import (
 from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
-from capsule_id.parameters import Parameter, parameter
+from capsule_id.parameters import SAME, STEP_SD, Parameter, parameter
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.rig.schema import Entry, GroundSettings
 from capsule_id.views import Comparison, Curve, Finding, Message, Points, ResultTable
@@ -290,8 +290,6 @@ def lint_line(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 # line replicates: Lack of fit of a calibration line against the scatter of repeated readings.
 
 
-#: Values of x closer than this count as repeated, relative to their range.
-SAME = 1e-9
 #: Smallest deviation of the levels from the line that counts, in sd of the repeated readings.
 SMALLEST_DEVIATION = 0.5
 
@@ -472,8 +470,8 @@ class Line(PointTest):
         self.scale_known = all(table.columns[name].sd is not None for name in (self.x_name, self.reading))
         super().__init__(table, rig, friction)
         step = y.unstated_step
-        self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
-        self.sds = {**self.sds, self.reading: max(self.sds[self.reading], self.step / np.sqrt(12.0))}
+        self.step = step if self.ordinary_line()[2] < step * STEP_SD else 0.0
+        self.sds = {**self.sds, self.reading: max(self.sds[self.reading], self.step * STEP_SD)}
 
     def slope_of(self, table: Table) -> Parameter:
         """Row of the slope."""

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import stats
 
+from capsule_id.parameters import SAME
 from capsule_id.views import Facts, Finding
 
 # series: Autocorrelation of a time series and a test of whiteness.
@@ -81,10 +82,6 @@ def weighted_mean(values: Sequence[float], sds: Sequence[float]) -> tuple[float,
 # judgement: p-values of random orders, and findings of one check of several experiments.
 
 
-#: Statistics that differ by less, relative to the size of the one found, are equal but for rounding.
-TIE = 1e-9
-
-
 def permutation_p(values: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], number: int) -> float:
     """Probability that a random order of ``values`` (n,) has as large a ``statistic`` (...), of orders (..., n).
 
@@ -92,7 +89,7 @@ def permutation_p(values: np.ndarray, statistic: Callable[[np.ndarray], np.ndarr
     """
     orders = np.random.default_rng(0).permuted(np.tile(values, (number, 1)), axis=1)
     found = statistic(values)
-    return float((1 + np.sum(statistic(orders) >= found - TIE * np.abs(found))) / (1 + number))
+    return float((1 + np.sum(statistic(orders) >= found - SAME * np.abs(found))) / (1 + number))
 
 
 def of_neighbours(values: np.ndarray) -> np.ndarray:

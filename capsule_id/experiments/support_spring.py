@@ -10,7 +10,7 @@ from scipy import stats
 from capsule_id.experiments.base import LEVEL, Fitted, refit
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.point_test import LINE_MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.parameters import INSTRUMENT_ERRORS, Parameter, by_index, parameter
+from capsule_id.parameters import INSTRUMENT_ERRORS, SPRINGS, Parameter, by_index, parameter
 from capsule_id.rig.model import Quantity, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Finding, Message
@@ -21,8 +21,8 @@ from capsule_id.views import Finding, Message
 #: Deflections of the twin and their reading error, m, and noise of the force relative to full scale.
 DEFLECTIONS, DEFLECTION_SD = np.linspace(0.0, 1e-3, 11), 1e-6
 SPRING_NOISE = 0.002
-#: Reference length, m, and its k2, N/m, for the cantilever law of the twin; sd of a measured length, m.
-LENGTH, LENGTH_OF, LENGTH_SD = 60e-3, 18960.0, 0.1e-3
+#: Length of the medium spring, m, for the cantilever law of the twin; sd of a measured length, m.
+LENGTH, LENGTH_SD = 60e-3, 0.1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     # A generator of their own: the readings of the other tests do not depend on these errors.
     errors = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**21,)))
     for spring, k2 in by_index("k2", values).items():
-        length = LENGTH * (LENGTH_OF / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
+        length = LENGTH * (SPRINGS["medium"] / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
         force = k2 * DEFLECTIONS
         columns = {
             "deflection [mm]": 1e3 * DEFLECTIONS + 1e3 * DEFLECTION_SD * errors.standard_normal(DEFLECTIONS.size),

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.parameters import LONGEST_PERIOD, STANDING
 from capsule_id.physics.batches import CHUNK, is_traced, lanes_of, run_lanes
 from capsule_id.physics.exact.engine import RunState, initial_lanes, kernel, run, take_step
 from capsule_id.physics.exact.taylor import CapsuleState, StepSeries, constants_of, touching
@@ -252,12 +253,10 @@ def _growth(
 
 # Excitation periods left out, and observed.
 DROPPED, OBSERVED = 300, 48
-# Longest period searched for, in excitation periods; at least REPEATS times as many must be observed.
-LONGEST, REPEATS = 16, 3
+# At least so many times as many periods must be observed as the longest one that is searched for has.
+REPEATS = 3
 # Two points of the Poincaré section are the same within these (m, m/s), and within this part of the motion's size.
 SAME_POSITION, SAME_VELOCITY, SAME_RELATIVE = 1e-7, 1e-4, 1e-3
-# A capsule that advances less than this per excitation period (m) stands still.
-STANDING = 1e-7
 
 
 @dataclass(frozen=True)
@@ -485,7 +484,7 @@ def period_of(x_rel: np.ndarray, rate: np.ndarray, Omega: float) -> int:
     are searched for that are observed three times.
     """
     scale = SAME_RELATIVE * float(np.max(np.hypot(x_rel, rate / Omega)))
-    for n in range(1, min(LONGEST, (len(x_rel) - 1) // REPEATS) + 1):
+    for n in range(1, min(LONGEST_PERIOD, (len(x_rel) - 1) // REPEATS) + 1):
         dx, dw = np.abs(x_rel[n:] - x_rel[:-n]), np.abs(rate[n:] - rate[:-n])
         if dx.max() <= min(SAME_POSITION, scale) and dw.max() <= min(SAME_VELOCITY, scale * Omega):
             return n

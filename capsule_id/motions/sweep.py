@@ -29,7 +29,7 @@ from capsule_id.motions.response import (
     with_exponents,
 )
 from capsule_id.output import replace_file
-from capsule_id.parameters import CAPSULE_LEAVES, LEAVES, SWEPT
+from capsule_id.parameters import CAPSULE_LEAVES, ENDS, LEAVES, SWEPT
 from capsule_id.physics.batches import CHUNK, lanes_of
 from capsule_id.physics.model import CapsuleParameters, Excitation, Initial, PeriodicDrive, without_absent
 
@@ -559,7 +559,7 @@ def _starts(starts: Initial | None) -> tuple[np.ndarray, np.ndarray, np.ndarray,
 # Draws are arrays of leaves; they may come from anywhere.
 
 
-QUANTILES = (0.025, 0.5, 0.975)
+QUANTILES = (ENDS[0], 0.5, ENDS[1])
 
 
 def draws_diagram(

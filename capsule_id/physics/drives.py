@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, TABLE, Parameter
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, ROUNDING, TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, Record, array_module
 from capsule_id.physics.forces import DEGREE, Series
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Piece
@@ -19,7 +19,7 @@ from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Piece
 
 
 # A lag below this part of the period acts as a delay of the switching times: equal to first order in the lag.
-SHORTEST_LAG = 1e-12
+SHORTEST_LAG = ROUNDING
 # A transient below this part of |P_on| + |P_off| has ended.
 ENDED = 1e-18
 

@@ -20,8 +20,9 @@ Contacts are switched by r alone: the force may pull just before opening. Where 
 the contacts and D of that instant (after a jump).
 """
 
+import math
 from dataclasses import dataclass, fields, replace
-from enum import IntEnum
+from enum import IntEnum, auto
 from functools import reduce
 from operator import and_
 from typing import Any, ClassVar, Protocol, TypeVar
@@ -32,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, TABLE, Parameter
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, ROUNDING, TABLE, TABLE_1, Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module, is_traced
 from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, Series, downhill, rod_on_capsule
 
@@ -198,24 +199,16 @@ class Excitation(Drive):
         return D[:order]
 
 
-# pi/2 in two parts, the first with 33 bits so that its multiples are exact; sine and cosine on |x| <= pi/4 (fdlibm).
-_HALF_PI = (1.57079632673412561417, 6.07710050650619224932e-11)
-_SINE = (
-    1.58969099521155010221e-10,
-    -2.50507602534068634195e-08,
-    2.75573137070700676789e-06,
-    -1.98412698298579493134e-04,
-    8.33333333332248946124e-03,
-    -1.66666666666666324348e-01,
-)
-_COSINE = (
-    -1.13596475577881948265e-11,
-    2.08757232129817482790e-09,
-    -2.75573143513906633035e-07,
-    2.48015872894767294178e-05,
-    -1.38888888888741095749e-03,
-    4.16666666666666019037e-02,
-)
+# pi/2 in two parts, the first with so many binary places that its multiples are exact; sin(pi) is what a double leaves of
+# pi.
+_PLACES = 32
+_HIGH = math.floor(2.0**_PLACES * np.pi / 2.0) / 2.0**_PLACES
+_HALF_PI = (_HIGH, np.pi / 2.0 - _HIGH + math.sin(math.pi) / 2.0)
+# Taylor coefficients of sin(x)/x - 1 and of cos(x) - 1 + x^2/2, the highest one first; the next would be below rounding on
+# |x| <= pi/4.
+_ORDERS = range(7, 0, -1)
+_SINE = [(-1.0) ** k / math.factorial(2 * k + 1) for k in _ORDERS]
+_COSINE = [-((-1.0) ** k) / math.factorial(2 * k + 2) for k in _ORDERS]
 
 
 @jax.custom_jvp
@@ -229,7 +222,7 @@ def cos_sin(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         sine, cosine = sine * z + S, cosine * z + C
     sine, cosine = y + y * z * sine, 1.0 - 0.5 * z + z * z * cosine
     quadrant = q - 4.0 * jnp.floor(0.25 * q)
-    odd = (quadrant == 1.0) | (quadrant == 3.0)
+    odd = (quadrant == 1.0) | (quadrant > 2.0)
     c = jnp.where(odd, sine, cosine) * jnp.where((quadrant == 1.0) | (quadrant == 2.0), -1.0, 1.0)
     s = jnp.where(odd, cosine, sine) * jnp.where(quadrant >= 2.0, -1.0, 1.0)
     one = c * c + s * s
@@ -248,8 +241,6 @@ Initial = tuple[NumberOrBatch, NumberOrBatch, NumberOrBatch, NumberOrBatch]
 
 # Bound on the steps of one lane: 348 periods of the busiest reference motion need 45,000.
 MAX_STEPS = 100_000
-# A normal force below this part of the weight is rounding, as on a slope of 90 degrees.
-NORMAL_ROUNDING = 1e-12
 # Leaves of the capsule that a friction law of its own replaces.
 _OWN_FRICTION = frozenset(row.symbol for row in CoulombStribeck.parameters)
 
@@ -280,7 +271,7 @@ class CapsuleParameters:
     mu: NumberOrBatch
     v_s: NumberOrBatch
     G: NumberOrBatch
-    g: NumberOrBatch = 9.81
+    g: NumberOrBatch = TABLE_1["g"]
     k_cubic: NumberOrBatch = 0.0
     c2: NumberOrBatch = 0.0
     k2_back: NumberOrBatch = 0.0
@@ -288,7 +279,7 @@ class CapsuleParameters:
     slope: NumberOrBatch = 0.0
     N0: NumberOrBatch = 0.0
     mu_back: NumberOrBatch | None = None
-    ratio: NumberOrBatch = 0.5
+    ratio: NumberOrBatch = CoulombStribeck.ratio
     viscous: NumberOrBatch = 0.0
     forces: Any = None
 
@@ -344,7 +335,7 @@ def pressed(p: CapsuleParameters, law: FrictionLaw) -> Any:
     if not isinstance(law, CoulombStribeck) or (p.slope is None and p.N0 is None):
         return p.m1 == p.m1
     size = (p.m1 + p.m2) * p.g + abs(0.0 if p.N0 is None else p.N0)
-    return NORMAL_ROUNDING * size < law.N
+    return ROUNDING * size < law.N  # on a slope of 90 degrees rounding is left
 
 
 def _signs() -> str:
@@ -362,8 +353,8 @@ class Status(IntEnum):
     OK = 0
     GRAZING = 1
     TOO_MANY_STEPS = 2
-    INVALID = 3
-    NOT_FINITE = 4
+    INVALID = auto()
+    NOT_FINITE = auto()
 
     @property
     def usable(self) -> bool:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from capsule_id.parameters import SAME
 from capsule_id.records.tones import noise_level
 from capsule_id.rig.filters import FEWEST_SAMPLES, PIECE, thinned
-from capsule_id.rig.model import SAME
 
 # duplicates: Finds readings that occur twice: equal tables, and equal blocks of rows within or across tables.
 #

@@ -9,6 +9,7 @@ from numpy.polynomial import polynomial
 from scipy import ndimage, signal
 from scipy.optimize import least_squares
 
+from capsule_id.parameters import ROUNDING
 from capsule_id.records.duplicates import EPSILON, reading_step
 from capsule_id.records.tones import AS_GOOD, BEYOND_CHANCE, ORDER, SIGNIFICANT, noise_level
 from capsule_id.rig.filters import FEWEST_SAMPLES, TIMING_TOLERANCE, largest_offset, median_step, thinned
@@ -70,7 +71,7 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: flo
     others = np.array([min(misfit(other + k * step, damping) for k in NEAR) for other in candidates])
     candidates, others = candidates[order := np.argsort(others)], others[order]
     others[:REFINED] = [best(other, damping)[0] for other in candidates[:REFINED]]
-    return candidates[others <= AS_GOOD * least + 1e-12 * float(np.sum(values**2))]
+    return candidates[others <= AS_GOOD * least + ROUNDING * float(np.sum(values**2))]
 
 
 def sampling(time: np.ndarray) -> tuple[float, bool]:
@@ -378,9 +379,9 @@ def _recurs(jumps: np.ndarray, precision: np.ndarray, place: int, period: float)
 REGULAR_SHARE = 0.9
 #: Largest distance of a step from a multiple of the sampling step, in sampling steps.
 STEP_TOLERANCE = 0.1
-#: Smallest and largest rounding of times, in sampling steps. Rounding moves a time by half of it: times that it moves less
+#: Smallest and largest step of rounded times, in sampling steps. Rounding moves a time by half of it: times that it moves less
 #: than this from the even grid count as even.
-ROUNDING = (2.0 * TIMING_TOLERANCE, 1.01)
+TIME_STEPS = (2.0 * TIMING_TOLERANCE, 1.01)
 #: A drop-out departs from both neighbours by this fraction of the range of the other samples.
 DROPOUT_RANGE = 0.5
 #: In coarse steps a smooth top is a short run too. A drop-out departs by more than this many reading steps, and than this
@@ -432,9 +433,9 @@ def time_rounding(time: np.ndarray) -> float | None:
         return None
     step, written = median_step(time), reading_step(time)
     off = largest_offset(time, (time[-1] - time[0]) / (len(time) - 1))
-    rounded = ROUNDING[0] * step <= written <= ROUNDING[1] * step
+    rounded = TIME_STEPS[0] * step <= written <= TIME_STEPS[1] * step
     # Rounding moves a time by half the written step, and the ends of the even grid by as much again.
-    return written if rounded and TIMING_TOLERANCE * step < off <= ROUNDING[1] * written else None
+    return written if rounded and TIMING_TOLERANCE * step < off <= TIME_STEPS[1] * written else None
 
 
 def _equal_runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

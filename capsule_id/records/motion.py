@@ -11,9 +11,9 @@ from scipy.special import logsumexp, softmax
 from scipy.stats import norm
 
 from capsule_id.errors import InputError
+from capsule_id.parameters import STANDING, STEP_SD
 from capsule_id.records.periods import (
     DECIDED,
-    VISIBLE,
     Repeat,
     find_period,
     first_true,
@@ -23,6 +23,7 @@ from capsule_id.records.periods import (
 )
 from capsule_id.records.tones import (
     BEYOND_CHANCE,
+    VISIBLE,
     Harmonic,
     fit_harmonic,
     recorded_drive,
@@ -37,8 +38,6 @@ from capsule_id.rig.model import Table
 # probability.
 
 
-#: Largest advance per excitation period of a standing capsule, m; ``response`` uses the same bound.
-STANDING_ADVANCE = 1e-7
 #: Confidence of a decision, moving or standing.
 CONFIDENCE = 0.99
 _MOST_HARMONICS = 24  # of the motion's frequency in the periodic part of X2
@@ -84,7 +83,7 @@ def fit_mean_velocity(time: Record, x_capsule: Record, T: float, period: int | N
     advance = velocity * T
     probability = _probabilities(advance, sd * T, float(np.ptp(x_capsule)))
     # A margin that is no number decides nothing.
-    moves, stands = abs(advance) - margin > STANDING_ADVANCE, abs(advance) + margin < STANDING_ADVANCE
+    moves, stands = abs(advance) - margin > STANDING, abs(advance) + margin < STANDING
     word = ("F" if advance > 0.0 else "B") if moves else "S" if stands else None
     reason = f"direction: advance {1e6 * advance:.3g} ± {1e6 * sd * T:.2g} um per period, standing is below 0.1 um"
     likeliest = max(probability.values()) if word is None else probability[word]
@@ -95,8 +94,8 @@ def _probabilities(advance: float, sd: float, largest: float) -> dict[str, float
     """Posterior probability of each direction, given the advance per period and its standard error, m."""
     if not np.isfinite(sd):
         return dict.fromkeys("FBS", 1.0 / 3.0)
-    moving = np.geomspace(STANDING_ADVANCE, max(largest, 2.0 * STANDING_ADVANCE, 2.0 * abs(advance)), _ADVANCES)
-    standing = np.linspace(-STANDING_ADVANCE, STANDING_ADVANCE, _ADVANCES)
+    moving = np.geomspace(STANDING, max(largest, 2.0 * STANDING, 2.0 * abs(advance)), _ADVANCES)
+    standing = np.linspace(-STANDING, STANDING, _ADVANCES)
     logs = {
         word: float(np.asarray(logsumexp(norm.logpdf(advance, values, np.maximum(sd, spacing)))))
         for word, values, spacing in (
@@ -325,7 +324,7 @@ def _shortfall(cycle: Cycle) -> Shortfall | None:
     terms = _linear_law_terms(cycle, near)
     shortfall = terms @ law - cycle.acceleration
     # A step that exceeds the motion clear of contact hides the noise: what is left is the rounding.
-    rounding = float(np.min(np.diff(np.unique(cycle.acceleration)))) / np.sqrt(12.0)
+    rounding = float(np.min(np.diff(np.unique(cycle.acceleration)))) * STEP_SD
     sd = max(float(np.std(shortfall[clear])), rounding)
     of_law = sd * np.linalg.norm(np.linalg.solve(triangle.T, (terms / scale).T), axis=0)
     of_terms = cycle.noise_sd * np.hypot(law[1] * near_sd[0], law[2] * near_sd[1])

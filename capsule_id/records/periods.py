@@ -9,7 +9,8 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.special import logsumexp, softmax
 
-from capsule_id.records.tones import noise_level
+from capsule_id.parameters import LONGEST_PERIOD
+from capsule_id.records.tones import FEWEST_IN_PERIOD, VISIBLE, noise_level
 from capsule_id.rig.filters import Record
 
 # fold: Folds a periodic record onto one period; the samples of each period lie between those of the others.
@@ -87,9 +88,8 @@ def intervals_above(z: Record, low: float, high: float) -> list[tuple[int, int]]
 # as that of fewer, independent ones (Satterthwaite). Standard deviations are relative to the rms of the motion.
 
 
-LONGEST_PERIOD = 16  # excitation periods; ``response`` uses the same bound
-#: Shortest record, in excitation periods, and fewest samples per excitation period.
-FEWEST_PERIODS, FEWEST_SAMPLES = 4, 4
+#: Shortest record, in excitation periods.
+FEWEST_PERIODS = 4
 #: Shortest record of an aperiodic motion, in excitation periods: it holds every period and two more.
 FEWEST_APERIODIC = LONGEST_PERIOD + 2
 #: A period is decided where its probability reaches this.
@@ -110,8 +110,6 @@ MOST_BANDS = 4
 LARGEST_HIDDEN = APERIODIC_SCATTER[0]
 #: Correlations of the scatter of successive cycles.
 CORRELATIONS = 0.6 * np.linspace(-1.0, 1.0, 5)
-#: Standard errors of a variance above which what it exceeds is visible.
-VISIBLE = 3.0
 _HIGHEST_DEGREE = 16  # of the polynomial over a cycle; a high degree on few samples amplifies their noise
 _GRID = 25  # standard deviations per range
 _DIFFERENCE_ORDER = 6  # of the differences for the noise level; the motion vanishes in them
@@ -172,8 +170,8 @@ def find_period(time: Record, x_rel: Record, T: float, floor: float = 0.0) -> Re
             f"the record holds {periods:.1f} periods of the drive, {FEWEST_PERIODS} are needed",
         ),
         (
-            T / step < FEWEST_SAMPLES,
-            f"the record holds {T / step:.1f} samples per period of the drive, {FEWEST_SAMPLES} are needed",
+            T / step < FEWEST_IN_PERIOD,
+            f"the record holds {T / step:.1f} samples per period of the drive, {FEWEST_IN_PERIOD} are needed",
         ),
         (
             motion <= noise_sd,

@@ -8,21 +8,21 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from capsule_id.records.tones import frequency_of, noise_level
+from capsule_id.records.tones import BEYOND_CHANCE, FEWEST_IN_PERIOD, SIGNIFICANT, frequency_of, noise_level
 from capsule_id.rig.filters import PIECE, loudest_part
 
-#: Turning points differ by this fraction of the record's range, and by so many standard deviations of the noise.
-TURN, TURN_SDS = 0.12, 5.0
+#: Turning points differ by this fraction of the record's range, and by more than noise.
+TURN = 0.12
 #: The last leg between turning points that has this fraction of the largest one belongs to the free decay.
 LEG = 0.3
 #: The part of a leg whose steepest place gives the period, and the time that a cosine takes for it, in periods.
 STEEP, STEEP_TIME = 0.3, 0.097
 #: Where the leg has passed this fraction of its height, the release is past.
 PAST = 0.8
-#: Samples in a period that suffice; of more, means are taken. Fewest of them, and fewest in a window.
-SAMPLES, FEWEST, WINDOW = 100, 4.0, 28
-#: The motion ends where it stays so close to its last value: fraction of the range, standard deviations of the noise.
-STILL, STILL_SDS = 0.015, 4.0
+#: Samples in a period that suffice; of more, means are taken. Fewest in a window.
+SAMPLES, WINDOW = 100, 28
+#: The motion ends where it stays so close to its last value: fraction of the range; or within the noise.
+STILL = 0.015
 #: Prior sds of dry friction, quadratic damping and a cubic spring, relative to the spring force at the amplitude.
 FURTHER = np.array([0.1, 0.2, 0.1])
 #: Error of the model relative to the amplitude, and what it gains with the sum of the further forces, up to a largest sum.
@@ -49,16 +49,16 @@ CHANGE = 0.1
 REGULAR, ALIKE, LEGS = 0.3, 0.15, 3
 #: A second excitation makes the amplitude this many times as large.
 GROWTH = 1.15
-#: A push moves the rod by this fraction of the range, and takes this many times as long as the free rod takes back.
-SMALLEST_PUSH, PUSHED = 0.05, 1.3
+#: A push moves the rod by this fraction of the range, and amplitudes differ by more than that of the largest one. A push
+#: takes this many times as long as the free rod takes back.
+SMALLEST, PUSHED = 0.05, 1.3
 #: Time constants after which a decay has died out.
 DIED_OUT = 4.0
-#: Between two releases of one record the motion is smaller than this fraction of both amplitudes, and no amplitude is
-#: counted below this fraction of the largest one. The first decay ends where its motion is this many times the smallest.
-BETWEEN, SMALLEST_RELEASE, ENDS = 0.3, 0.05, 1.25
-#: The last part of a pull, relative to the amplitude, where the search for its release begins; largest deflections of a rod
-#: at rest, in standard deviations of the noise.
-PULLED, RESTS = 0.7, 6.0
+#: Between two releases of one record the motion is smaller than this fraction of both amplitudes. The first decay ends
+#: where its motion is this many times the smallest.
+BETWEEN, ENDS = 0.3, 1.25
+#: The last part of a pull, relative to the amplitude, where the search for its release begins.
+PULLED = 0.7
 
 Poles = tuple[float, float]
 
@@ -128,7 +128,7 @@ def find_releases(time: np.ndarray, values: np.ndarray, displacement: bool = Fal
             low = top + int(np.argmax(motion[top:stop] <= ENDS * least))
             # At rest the next pull is seen when it begins; in a swing it hides.
             over = np.flatnonzero(motion[low:stop] > 2.0 * least)
-            resting = least < RESTS * noise_level(values[first:stop])
+            resting = least < BEYOND_CHANCE * noise_level(values[first:stop])
             stop = low if not resting else low + int(over[0]) if len(over) else stop
         for row in (first + int(np.argmax(far[first:stop] > PULLED * motion[top])), first):
             decay = find_free_decay(time[row:stop], values[row:stop], displacement)
@@ -144,7 +144,7 @@ def find_releases(time: np.ndarray, values: np.ndarray, displacement: bool = Fal
 
 def _lowest_between(motion: np.ndarray, step: int) -> list[int]:
     """Rows of the smallest motion between two amplitudes, for which every ``step``-th row is looked at."""
-    level = np.log(np.maximum(motion[::step], SMALLEST_RELEASE * np.max(motion))).tolist()
+    level = np.log(np.maximum(motion[::step], SMALLEST * np.max(motion))).tolist()
     top, low, cuts = level[0], 0, list[int]()
     for i, here in enumerate(level):
         if here - level[low] > -np.log(BETWEEN) < top - level[low]:
@@ -171,7 +171,7 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
     last = int(np.flatnonzero(sizes >= LEG * np.max(sizes))[-1])
     period, past = _scale(time, values, int(turns[last]), int(turns[last + 1]))
     decay, over = None, float(time[turns[last + 1]])
-    if period >= FEWEST * np.median(np.diff(time)):
+    if period >= FEWEST_IN_PERIOD * np.median(np.diff(time)):
         lengths, first = np.diff(time[turns]), last
         while (
             first
@@ -222,7 +222,7 @@ def _push(time: np.ndarray, values: np.ndarray, start: float, period: float) -> 
     away = values[:near] - values[min(int(np.searchsorted(time, start + 0.5 * period)), len(values) - 1)]
     top = int(np.argmax(np.abs(away)))
     height = np.sign(away[top]) * (values - values[0])
-    climbs = height[top] > SMALLEST_PUSH * np.ptp(values[row:]) and height[row - 1] > 0.5 * height[top]
+    climbs = height[top] > SMALLEST * np.ptp(values[row:]) and height[row - 1] > 0.5 * height[top]
     if not climbs or time[top] - time[0] > 0.5 * period:
         return start, False
     high = np.flatnonzero(height[: top + 1] < PAST * height[top])[-1]
@@ -235,7 +235,7 @@ def _push(time: np.ndarray, values: np.ndarray, start: float, period: float) -> 
 def _turning_points(values: np.ndarray) -> np.ndarray:
     """Indices of the turning points that differ by more than noise, and of the ends of the first and the last leg."""
     levels = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
-    limit = max(TURN * float(np.ptp(levels)), TURN_SDS * noise_level(values))
+    limit = max(TURN * float(np.ptp(levels)), SIGNIFICANT * noise_level(values))
     turns, side, turn, other = list[int](), 0, 0, 0
     levels = levels.tolist()
     for i, level in enumerate(levels):
@@ -269,9 +269,9 @@ def _growth(time: np.ndarray, values: np.ndarray, turns: np.ndarray) -> float | 
     """Time before legs between ``turns`` that grow; None where none does. Two of them grow, and three were lower."""
     sizes = np.abs(np.diff(values[turns]))
     highest = np.max(np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (2, 0), mode="edge"), 3), axis=1)
-    grown = sizes > GROWTH * np.minimum.accumulate(
-        np.concatenate([highest[:1], highest[:-1]])
-    ) + SMALLEST_PUSH * np.max(sizes)
+    grown = sizes > GROWTH * np.minimum.accumulate(np.concatenate([highest[:1], highest[:-1]])) + SMALLEST * np.max(
+        sizes
+    )
     twice = 1 + np.flatnonzero(grown[1:-1] & grown[2:])
     return float(time[turns[twice[0]]]) if len(twice) else None
 
@@ -303,7 +303,7 @@ class _Record:
         size = max(min(int(period / np.median(np.diff(time)) / SAMPLES), len(time) // WINDOW), 1)
         time, values = (a[: len(a) // size * size].reshape(-1, size).mean(axis=1) for a in (time, values))
         noise, last = noise_level(values), np.median(values[-max(5, len(values) // 20) :])
-        far = np.flatnonzero(np.abs(values - last) > max(STILL_SDS * noise, STILL * float(np.ptp(values))))
+        far = np.flatnonzero(np.abs(values - last) > max(SIGNIFICANT * noise, STILL * float(np.ptp(values))))
         anchor = min(int(np.searchsorted(time, past)), max(len(time) - 10, 0))
         end = max(far[-1] + 1 if len(far) else 0, anchor + 12)
         return cls(time[:end], values[:end], period, noise), anchor
@@ -546,7 +546,7 @@ def _earlier(record: _Record, row: int, fit: _Fit) -> tuple[float, float | None]
         part = slice(record.at(end - 2.0 * period), record.at(end))
         values, stays = record.values[part], end - time[part.start] > EARLIER * period
         ends_here = end > time[row] - period
-        if len(values) < 6 or np.ptp(values) < 2.0 * STILL_SDS * record.noise or not (stays or ends_here):
+        if len(values) < 6 or np.ptp(values) < 2.0 * SIGNIFICANT * record.noise or not (stays or ends_here):
             continue
         poles = record.fit(part.start, part.stop, [fit.poles], 4).poles if stays else fit.poles
         columns = _motions(poles[0] * (time[part] - end), poles[1])[0]

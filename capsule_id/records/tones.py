@@ -64,9 +64,11 @@ def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
 NORMAL_QUARTILE = float(stats.halfnorm.median())
 #: Order of the differences that remove a well-sampled decay.
 ORDER = 3
-#: Standard deviations, or standard errors, that a single value exceeds by chance once in 16,000 times, and that no sample
-#: of a long record does: once in 5e8.
-SIGNIFICANT, BEYOND_CHANCE = 4.0, 6.0
+#: Levels of all detectors, in standard deviations or standard errors. A single value exceeds the first by chance once in
+#: 400 times, the second once in 16,000 times, the third once in 5e8 times: no sample of a long record does.
+VISIBLE, SIGNIFICANT, BEYOND_CHANCE = 3.0, 4.0, 6.0
+#: Fewest samples in a period of a motion that a record can show.
+FEWEST_IN_PERIOD = 4
 #: A fit counts as good as the best one if it leaves at most this many times its sum of squares.
 AS_GOOD = 1.5
 #: Part of the energy of a decay before it is all noise.
@@ -181,6 +183,13 @@ def fit_harmonic(time: Record, values: Record, Omega: float) -> Harmonic:
     return _harmonic_at(time, values, other if better else found, Omega)
 
 
+def _spectrum(time: Record, values: Record) -> tuple[np.ndarray, np.ndarray, float]:
+    """Frequencies, Hz, power of an evenly sampled record at them, and half of the width of a line, Hz."""
+    n, step = len(time), float(time[-1] - time[0]) / (len(time) - 1)
+    power = np.abs(np.fft.rfft((values - np.mean(values)) * np.hanning(n), 4 * n)) ** 2
+    return np.fft.rfftfreq(4 * n, step), power, 2.0 / (n * step)
+
+
 def other_tone(time: Record, values: Record) -> float | None:
     """Frequency, Hz, of a narrow line in the spectrum of an oscillation, beside its own and its multiples; None without one.
 
@@ -188,9 +197,7 @@ def other_tone(time: Record, values: Record) -> float | None:
     ----------
     time, values : (n,) s, evenly spaced, and any unit
     """
-    n, step = len(time), float(time[-1] - time[0]) / (len(time) - 1)
-    power = np.abs(np.fft.rfft((values - np.mean(values)) * np.hanning(n), 4 * n)) ** 2
-    f, width = np.fft.rfftfreq(4 * n, step), 2.0 / (n * step)
+    f, power, width = _spectrum(time, values)
     own = float(f[np.argmax(np.where(f < width, 0.0, power))])
     line = np.pad((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]), 1)
     line &= (f > 3.0 * width) & (np.abs(f - own) > 6.0 * width) & (power > LEAST_POWER * np.max(power[f >= width]))
@@ -211,17 +218,15 @@ def lasting_tone(time: Record, values: Record, own: float) -> float:
     time, values : (n,) s, evenly spaced, and any unit
     own : frequency of the decay, Hz, near whose first multiples the errors of its model lie
     """
-    n, step = len(time), float(time[-1] - time[0]) / (len(time) - 1)
-    power = np.abs(np.fft.rfft((values - np.mean(values)) * np.hanning(n), 4 * n)) ** 2
-    f, width = np.fft.rfftfreq(4 * n, step), 2.0 / (n * step)
+    f, power, width = _spectrum(time, values)
     multiple = np.clip(np.round(f / own), 1.0, MULTIPLES)
     apart = np.where((f > width) & (np.abs(f - multiple * own) > width), power, 0.0)
     best = int(np.argmax(apart))
     if not apart[best] > PROMINENT * np.median(power):
         return 0.0
     Omega = _refine(time, values, 2.0 * np.pi * float(f[best]))[0]
-    found = Omega / (2.0 * np.pi)
-    first, second = (tone_at(time[part], values[part], Omega)[0] for part in (slice(n // 2), slice(n // 2, None)))
+    found, half = Omega / (2.0 * np.pi), len(time) // 2
+    first, second = (tone_at(time[part], values[part], Omega)[0] for part in (slice(half), slice(half, None)))
     return found if abs(found - own) > NEAR * own and LASTING * first < second < first / LASTING else 0.0
 
 

@@ -9,9 +9,10 @@ from types import MappingProxyType
 
 import numpy as np
 
+from capsule_id.parameters import SAME
 from capsule_id.rig.formats.raw import NO_READING, Export, Layout, Place, RawTable
 from capsule_id.rig.formats.text import seconds_of_stamps
-from capsule_id.rig.model import NO_DRIFT, SAME, Column, Instrument, Quantity, Table
+from capsule_id.rig.model import NO_DRIFT, Column, Instrument, Quantity, Table
 from capsule_id.rig.schema import (
     INSTRUMENT_KEYS,
     WHOLE,

@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import Prior
+from capsule_id.parameters import ROUNDING, STEP_SD, Prior
 from capsule_id.views import Finding, counted
 
 
@@ -22,8 +22,6 @@ class Quantity:
     sd: float = 0.0
 
 
-#: Relative difference below which numbers of two programs are the same, and largest rounding error of a converted number.
-SAME, ROUNDING = 1e-9, 1e-12
 #: Fewest samples of a record: six unknowns of a free decay (k1, c, amplitude, phase, offset, noise) and two more.
 SHORTEST_RECORD = 8
 #: A clock that agrees with true time.
@@ -96,7 +94,7 @@ class Column:
     @property
     def reading_sd(self) -> float:
         """Stated error and the rounding error of the reading step, step/sqrt(12), added in quadrature; SI."""
-        return float(np.hypot(self.sd or 0.0, (self.resolution or 0.0) / np.sqrt(12.0)))
+        return float(np.hypot(self.sd or 0.0, (self.resolution or 0.0) * STEP_SD))
 
     @property
     def unstated_step(self) -> float:

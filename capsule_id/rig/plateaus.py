@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from capsule_id.parameters import SAME
 from capsule_id.rig.filters import hampel_outliers, median_step
 from capsule_id.rig.formats.raw import Place, RawTable
-from capsule_id.rig.model import SAME
 from capsule_id.rig.schema import ChoiceRule, KindRule, PlainRule, SettingRule, read_rules
 from capsule_id.rig.toml import Node, is_number, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale

@@ -16,7 +16,7 @@ import numpy as np
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError, collecting, raise_all
-from capsule_id.parameters import Parameter, Prior
+from capsule_id.parameters import ROUNDING, TABLE_1, Parameter, Prior
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
 from capsule_id.rig.formats.text import is_stamp
@@ -30,7 +30,7 @@ from capsule_id.rig.maps import (
     refuse_idle_errors,
     without_stated_errors,
 )
-from capsule_id.rig.model import ROUNDING, Column, Quantity, Rig, Settings, Table
+from capsule_id.rig.model import Column, Quantity, Rig, Settings, Table
 from capsule_id.rig.plateaus import Plateaus, read_plateaus, readings_of_plateaus, without_outliers
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
@@ -56,7 +56,6 @@ from capsule_id.views import Finding
 # folder: ``rig.toml`` and the rules between its entries.
 
 
-STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
 _READING_ERRORS = ("_sd", "_resolution", "_instrument")
 #: Smallest stated reading error relative to the largest reading; below it rounding exceeds the error.
 SMALLEST_RELATIVE_ERROR = ROUNDING
@@ -118,7 +117,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
 
 def _read_head(head: Node, faults: list[InputError]) -> tuple[dict[str, Any], dict[str, Quantity]]:
     """Words and quantities of [rig]; errors are appended to ``faults``."""
-    words, stated = dict[str, Any](), {"g": Quantity(STANDARD_GRAVITY)}
+    words, stated = dict[str, Any](), {"g": Quantity(TABLE_1["g"])}
     with collecting(faults):
         head.refuse_unknown(TABLE_KEYS["[rig]"], TABLE_KEYS)
         if "name" not in head:

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
+from capsule_id.parameters import STEP_SD
 from capsule_id.rig.filters import FEWEST_PERIODS, FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.model import NO_DRIFT, Quantity
@@ -65,7 +66,7 @@ def evened(time: np.ndarray) -> Evened | None:
     ends = [linprog([0, sign], np.vstack([-rise, rise]), limits, bounds=[(None, None)] * 2).x[1] for sign in (1, -1)]
     step = even + tick * float(np.mean(ends))
     times = float(np.mean(time)) + step * (index - 0.5 * (len(time) - 1))
-    return Evened(times, "times.ticks", tick, tick * float(np.ptp(ends)) / np.sqrt(12.0) / step)
+    return Evened(times, "times.ticks", tick, tick * float(np.ptp(ends)) * STEP_SD / step)
 
 
 class Record(NamedTuple):

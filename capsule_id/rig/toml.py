@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError, raise_all
-from capsule_id.parameters import Prior
-from capsule_id.rig.model import ROUNDING, Quantity
+from capsule_id.parameters import ROUNDING, Prior
+from capsule_id.rig.model import Quantity
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 # domains: Intervals of admissible values.

@@ -13,8 +13,9 @@ import time
 import numpy as np
 import pytest
 
-from capsule_id.motions.response import DROPPED, OBSERVED, STANDING
+from capsule_id.motions.response import DROPPED, OBSERVED
 from capsule_id.motions.sweep import diagram
+from capsule_id.parameters import STANDING
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from tests.scipy_capsule import simulate_scipy
 

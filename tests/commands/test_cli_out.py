@@ -295,7 +295,7 @@ def test_resume_is_promised_where_something_is_saved(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("capsule_id.commands.rigs.make_experiments", interrupted)
+    monkeypatch.setattr("capsule_id.commands.fit.make_experiments", interrupted)
     assert fit_params(["rig", "--no-sample", "--out", "out"]) == 130
     assert capsys.readouterr().err == "fit-params: interrupted\n"
     assert {path.name for path in here.iterdir()} == {"rig"}

@@ -11,7 +11,7 @@ import dask
 import pytest
 
 from capsule_id.cli import fit_params
-from capsule_id.commands import rigs as many_rigs
+from capsule_id.commands import fit as many_rigs
 from capsule_id.commands.bifurcate import client_of
 from tests.cli_tools import listing, message, small_rig
 

@@ -9,7 +9,7 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.cli import capsule_id
 from capsule_id.commands import bifurcate
-from capsule_id.commands.measured_runs import overlay
+from capsule_id.commands.bifurcate import overlay
 from capsule_id.report.figures.sweeps import MeasuredPoint
 from capsule_id.synthetic import synthesize
 

@@ -20,7 +20,8 @@ from capsule_id.experiments.free_vibration.decrement import (
     viscous_fit,
 )
 from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_aliases
-from capsule_id.experiments.free_vibration.second_fit import Screening, open_models, rank
+from capsule_id.experiments.free_vibration.screening import Screening
+from capsule_id.experiments.free_vibration.second_fit import open_models, rank
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
 from capsule_id.inference.sampling import DEFAULT_BUDGET

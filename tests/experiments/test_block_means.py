@@ -23,7 +23,7 @@ from capsule_id.experiments.free_vibration.readings import (
     is_even,
 )
 from capsule_id.experiments.free_vibration.record import ReadingTimes, averaged_process, whiten_by_shape
-from capsule_id.experiments.free_vibration.second_fit import Screening
+from capsule_id.experiments.free_vibration.screening import Screening
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.records import release
 from tests.capsule_cases import jit_quickly

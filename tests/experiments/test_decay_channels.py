@@ -22,7 +22,8 @@ from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.experiments.free_vibration.readings import CHANNELS, DecayModel
 from capsule_id.experiments.free_vibration.record import Screened
-from capsule_id.experiments.free_vibration.second_fit import Screening, second_models
+from capsule_id.experiments.free_vibration.screening import Screening
+from capsule_id.experiments.free_vibration.second_fit import second_models
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.views import Finding

@@ -21,10 +21,9 @@ from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.tables import check_engine
 from capsule_id.inference.target import LogPosterior
-from capsule_id.physics.displacement import TOGETHER
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters
-from capsule_id.physics.simulation import simulate
+from capsule_id.physics.simulation import TOGETHER, simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.synthetic import ROBOT, RobotDesign, synthesize_robot
 from tests.capsule_cases import jit_quickly
@@ -162,7 +161,7 @@ def test_new_values_and_other_settings_need_no_new_program(folder: Path, monkeyp
         traced.append(given)
         return simulate(*given, **words)
 
-    monkeypatch.setattr("capsule_id.physics.displacement.simulate", counted)
+    monkeypatch.setattr("capsule_id.physics.simulation.simulate", counted)
     before = e.responses({**THETA, "mu": 0.2})[0]
     traced.clear()  # The first program may be older than this test.
     after = e.responses({**THETA, "mu": 0.3})[0]

@@ -19,12 +19,11 @@ from capsule_id.experiments.free_vibration.lint import MESSAGES, lint_decay
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.record import Screened
+from capsule_id.experiments.free_vibration.screening import Screening, hum_of
 from capsule_id.experiments.free_vibration.second_fit import (
     BIC_MARGIN,
     Ranking,
-    Screening,
     demands_another,
-    hum_of,
     second_models,
     simplest,
 )

@@ -6,9 +6,8 @@ import pytest
 
 from capsule_id.errors import InputError
 from capsule_id.motions.response import Settling, period_of, response, settle
-from capsule_id.physics.energy import energy_balance
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
-from capsule_id.physics.simulation import simulate
+from capsule_id.physics.simulation import energy_balance, simulate
 from tests.capsule_cases import Cases
 
 # Motions of other periods, found by a scan: (m2, k2, c, mu, G, P_d, Omega) -> label.

@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import CoulombStribeck, Scaled, friction_law, scaled
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
-from capsule_id.physics.simulation import simulate
+from capsule_id.physics.simulation import displacement, simulate
 from tests.capsule_cases import jit_quickly
 
 PERIOD = 1e-3 * np.array([40.0, 60.0, 80.0, 100.0, 140.0])

@@ -6,9 +6,8 @@ from scipy.integrate import quad
 from scipy.linalg import expm
 
 from capsule_id.errors import InputError
-from capsule_id.physics.energy import energy_balance
 from capsule_id.physics.model import CapsuleParameters, Excitation
-from capsule_id.physics.simulation import simulate
+from capsule_id.physics.simulation import energy_balance, simulate
 from tests.capsule_cases import Cases, states_of
 
 M1, M2, g = 0.11, 0.53, 9.81

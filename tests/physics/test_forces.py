@@ -15,10 +15,9 @@ from capsule_id.motions.response import response
 from capsule_id.parameters import Parameter
 from capsule_id.physics import forces as steps
 from capsule_id.physics.drives import RodMotion
-from capsule_id.physics.energy import energy_balance
 from capsule_id.physics.forces import CoulombStribeck, Force, Spring, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Excitation
-from capsule_id.physics.simulation import simulate
+from capsule_id.physics.simulation import energy_balance, simulate
 from capsule_id.physics.smooth.engine import breakaway, force_gate, friction_smooth
 from tests.scipy_capsule import simulate_scipy
 

@@ -12,7 +12,6 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.parameters import Parameter
-from capsule_id.physics.energy import energy_balance
 from capsule_id.physics.exact.taylor import by_chain_rule
 from capsule_id.physics.forces import (
     CoulombStribeck,
@@ -23,7 +22,7 @@ from capsule_id.physics.forces import (
     sliding_friction,
 )
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
-from capsule_id.physics.simulation import simulate
+from capsule_id.physics.simulation import energy_balance, simulate
 from tests.capsule_cases import Cases, assert_both_ways_as_scipy, jit_quickly, states_of
 from tests.scipy_capsule import simulate_scipy
 

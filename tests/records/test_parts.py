@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from capsule_id.records.motion import STANDING_ADVANCE, fit_mean_velocity
+from capsule_id.parameters import STANDING
+from capsule_id.records.motion import fit_mean_velocity
 from capsule_id.records.periods import find_period, intervals_above, local_polynomials
 from capsule_id.records.tones import noise_level
 
@@ -114,7 +115,7 @@ def test_mean_velocity_and_its_standard_error() -> None:
         (5e-6, 5e-6, "F"),
         pytest.param(-5e-6, 5e-6, "B", marks=pytest.mark.full),
         (0.0, 5e-6, "S"),
-        (STANDING_ADVANCE, 5e-6, None),
+        (STANDING, 5e-6, None),
         pytest.param(2e-7, 1e-4, None, marks=pytest.mark.full),
     ],
 )

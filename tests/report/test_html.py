@@ -13,12 +13,12 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH
-from capsule_id.experiments.free_vibration.experiment import DISAGREE, FAIL
 from capsule_id.experiments.friction_variants import FACTOR
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.inference.checks.posterior import AGREEMENT_LEVEL, FARTHEST_MAXIMUM, PRIOR_PULL
 from capsule_id.inference.checks.settings import ORDER_LEVEL, SMALLEST_CORRELATION
 from capsule_id.inference.result import Provenance, Result
+from capsule_id.records.tones import SIGNIFICANT, VISIBLE
 from capsule_id.report.columns import table_rows, verdict_text
 from capsule_id.report.html import Picture, pictures, render
 from capsule_id.report.messages import QUESTIONS, TERMS, finding_text, messages_of, question_of
@@ -149,8 +149,9 @@ def test_the_limits_of_the_questions_are_those_of_the_checks() -> None:
     limits = {
         "sample.maximum": {FARTHEST_MAXIMUM}, "priors.tails": {PRIOR_PULL}, "trials.loads": {ORDER_LEVEL},
         "trials.order": {SMALLEST_CORRELATION, ORDER_LEVEL}, "trials.tables": {ORDER_LEVEL}, "trials.speeds": {ORDER_LEVEL},
-        "bench_and_runs.agree": {AGREEMENT_LEVEL}, "runs.predictable": {LARGEST_GROWTH}, "decays.halves": {FAIL, DISAGREE},
-        "friction.variants": {FACTOR}, "starts.agree": {0.0}, "springs.cantilever": {LEVEL, 3.0},
+        "bench_and_runs.agree": {AGREEMENT_LEVEL}, "runs.predictable": {LARGEST_GROWTH},
+        "decays.halves": {SIGNIFICANT, VISIBLE}, "friction.variants": {FACTOR}, "starts.agree": {0.0},
+        "springs.cantilever": {LEVEL, 3.0},
     }  # fmt: skip
     for code, numbers in said.items():
         assert numbers == limits.get(code, {LEVEL} if numbers else set()), code

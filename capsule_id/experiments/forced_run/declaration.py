@@ -13,7 +13,7 @@ from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.lint import USUAL, lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, OF_DERIVATIVE, SIGN_ERRORS, derivative_ratio, drive_power, phasor
-from capsule_id.records.tones import recorded_drive, stated_Omega
+from capsule_id.records.tones import FEWEST_IN_PERIOD, recorded_drive, stated_Omega
 from capsule_id.records.view import describe_run
 from capsule_id.rig.filters import median_step, sampling_step
 from capsule_id.rig.model import Column, Quantity, Rig, Table
@@ -158,8 +158,6 @@ DRIVE_RULES = (
 
 #: Harmonics of the drive that are compared, and the smallest share of the acceleration's standard deviation there.
 HARMONICS, STRONG = range(1, 6), 0.15
-#: Fewest samples in a period of the drive, or of one of its harmonics.
-FEWEST_SAMPLES = 4.0
 #: Admissible ratio of the recorded acceleration to that of x_rel alone: the motion of the capsule is unknown.
 RATIO_OF_X_REL = (0.1, 10.0)
 
@@ -172,7 +170,7 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     faults = list[Finding]()
     samples, periods = period / median_step(time), float(time[-1] - time[0]) / period
     # The record holds no period of the stated frequency, or its sampling cannot follow it.
-    if samples < FEWEST_SAMPLES or periods < 1.0:
+    if samples < FEWEST_IN_PERIOD or periods < 1.0:
         facts = {"file": table.file, "periods": periods, "samples": samples}
         faults.append(Finding("runs.time_scale", "fail", facts, table.label))
     for name in table.columns:

@@ -14,12 +14,13 @@ from scipy.integrate import solve_ivp
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import LEVEL, Fitted, Start, ValuesBySymbol, axis_label, band, stacked, stretch
 from capsule_id.experiments.capsule_experiment import lag_of
-from capsule_id.experiments.forced_run.declaration import FEWEST_SAMPLES, SETTLING_PERIODS
+from capsule_id.experiments.forced_run.declaration import SETTLING_PERIODS
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
 from capsule_id.experiments.kind import Estimate
 from capsule_id.experiments.statistics import autocorrelation, further_columns, judged
+from capsule_id.parameters import ENDS
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
 from capsule_id.physics.forces import FrictionLaw, downhill, grazing_load, rod_on_capsule
 from capsule_id.physics.model import (
@@ -32,7 +33,8 @@ from capsule_id.physics.model import (
     without_absent,
 )
 from capsule_id.records.motion import fit_mean_velocity, measured_motion
-from capsule_id.records.tones import relative_position, stated_gap, stated_Omega, tone_at
+from capsule_id.records.periods import FEWEST_PERIODS
+from capsule_id.records.tones import FEWEST_IN_PERIOD, relative_position, stated_gap, stated_Omega, tone_at
 from capsule_id.records.view import FILTER_ORDER, PASS_BAND_MULTIPLE, SMALLEST_RATE_GAIN, RunRecord, view_record
 from capsule_id.rig.filters import (
     dominant_frequency,
@@ -195,8 +197,6 @@ def check_predictable(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
 
 #: Largest number of harmonics of the excitation.
 HARMONICS = 10
-#: Fewest whole periods of a record: in fewer ones a slow error of the noise looks like a repeated one.
-FEWEST_PERIODS = 4
 
 
 def check_repeated(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
@@ -214,7 +214,8 @@ def repetition(run: CapsuleRun, residuals: Float[np.ndarray, " n"]) -> tuple[flo
     """F statistic of the harmonics of the excitation in ``residuals``, and its p-value; None for a short record."""
     cycles = run.cycles
     periods = float(cycles[-1] - cycles[0])
-    number = min(HARMONICS, int(len(cycles) / periods / FEWEST_SAMPLES))
+    number = min(HARMONICS, int(len(cycles) / periods / FEWEST_IN_PERIOD))
+    # In fewer periods a slow error of the noise looks like a repeated one.
     if periods < FEWEST_PERIODS or number < 1:
         return None
     angle = 2.0 * np.pi * np.outer(cycles, np.arange(1, number + 1))
@@ -290,7 +291,7 @@ def _motion_row(run: CapsuleRun, fit: Fitted) -> dict[str, object]:
     if sample is not None:
         error = sd * np.random.default_rng(0).standard_normal((ERRORS, 1))
         velocities = error + np.array([velocity(place) for place in np.asarray(sample.X2)])
-        row["95 % band, mm/s"] = "{:.4g} to {:.4g}".format(*np.quantile(velocities, [0.025, 0.975]))
+        row["95 % band, mm/s"] = "{:.4g} to {:.4g}".format(*np.quantile(velocities, ENDS))
     if found is not None:
         row["mean velocity, record, mm/s"] = f"{1e3 * found.velocity:.4g} ± {sd:.2g}"
     return row

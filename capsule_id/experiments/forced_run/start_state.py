@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import nnls
 
 from capsule_id.experiments.base import About
-from capsule_id.records.tones import noise_level, tone_at
+from capsule_id.records.tones import SIGNIFICANT, noise_level, tone_at
 from capsule_id.rig.model import Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 
@@ -80,8 +80,6 @@ def _slide(time: np.ndarray, r: np.ndarray, momentum: np.ndarray, direction: flo
 #: Number of samples of the polynomials through the start of the record. A line gives the capsule's speed, a parabola
 #: position and speed of the rod.
 LINE_SAMPLES, PARABOLA_SAMPLES = 4, 9
-#: The capsule counts as moving where its initial speed exceeds its standard error by this factor.
-MOVING = 4.0
 #: Frequency, rad/s, and damping ratio of the rod at the medians of the default priors. Without a current they give the
 #: lag of x_rel's fundamental behind the drive, which suffices as a starting value.
 ROD_FREQUENCY, ROD_DAMPING = 115.0, 0.16
@@ -157,7 +155,7 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
     capsule_rate = 0.0
     if "x_capsule" in channels:
         (_, slope), factor = _polynomial(time, channels["x_capsule"], LINE_SAMPLES, 1)
-        if abs(slope) > MOVING * factor * noise["x_capsule"]:
+        if abs(slope) > SIGNIFICANT * factor * noise["x_capsule"]:
             capsule_rate = slope
     return RunStart(x_rel, rate, capsule_rate, length, amplitude, phase, noise)
 

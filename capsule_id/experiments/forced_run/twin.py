@@ -10,7 +10,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.declaration import RUN_SPRINGS, SETTLING_PERIODS
 from capsule_id.experiments.kind import Twin, TwinTable, Values
-from capsule_id.parameters import QUANTILE_975
+from capsule_id.parameters import FIG_6, QUANTILE_975
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, rod_acceleration, status_message
 from capsule_id.physics.simulation import simulate
 
@@ -31,7 +31,7 @@ class RunSetup:
 #: The shortest contact has 11 samples, and 8 excitation periods follow the transient.
 HARD = RunSetup("hard", 26.58, 2.5, 1.5e-3, 6100)
 RUNS = (
-    RunSetup("medium", 34.56, 4.0, 1.0e-3, 2850, 0.6e-3),
+    RunSetup("medium", **FIG_6, samples=2850, step=0.6e-3),
     RunSetup("stiff", 73.58, 1.2, 1.0e-3, 2650),
     HARD,
     replace(HARD, Omega=46.0, samples=3800),

@@ -32,6 +32,7 @@ from capsule_id.experiments.free_vibration.readings import (
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.parameters import Parameter, Prior, nuisance, scatter
 from capsule_id.records.release import shortened
+from capsule_id.records.tones import FEWEST_IN_PERIOD
 from capsule_id.rig.filters import median_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, Entry
@@ -136,9 +137,9 @@ def _faults(entry: Entry[DecaySettings]) -> Iterator[tuple[Any, ...]]:
     )
     thin = settings.thin or 1
     if thin > 1:
-        size = block_size(*decay_window(table), FEWEST_MEANS)
+        size = block_size(*decay_window(table), FEWEST_IN_PERIOD)
         most = min(inside // SHORTEST_RECORD, max(size, 2))
-        rule = f"thin must leave {SHORTEST_RECORD} means of the record and {FEWEST_MEANS} means in a period"
+        rule = f"thin must leave {SHORTEST_RECORD} means of the record and {FEWEST_IN_PERIOD} means in a period"
         remedy = f"write thin = {most} or less" if most > 1 else "remove thin"
         yield thin > most, "thin", rule, f"{thin} of {counted(inside, 'sample')}", remedy
 
@@ -167,8 +168,6 @@ def _check_settings(entry: Entry[DecaySettings]) -> None:
             raise entry.error(*words)
 
 
-#: Fewest block means in a period.
-FEWEST_MEANS = 4
 #: Largest distance of an interval between turning points from a multiple of the median one, relative to that.
 UNEQUAL = 0.25
 

@@ -14,15 +14,13 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from capsule_id.records.release import shortened
-from capsule_id.records.tones import frequency_of, length_of_motion, noise_level
+from capsule_id.records.tones import SIGNIFICANT, frequency_of, length_of_motion, noise_level
 from capsule_id.rig.filters import dominant_frequency
 
 #: Largest damping ratio of a decay by half cycles. They are wrong by 3e-6 of the amplitude there, by 2e-3 at 0.9.
 STRONGEST = 0.7
 #: Smallest |omega^2| relative to omega_0^2: nearer to critical damping the derivative of its root loses all digits.
 CRITICAL = 1e-10
-#: Smallest peak in standard deviations of the noise.
-PEAK_NOISE_RATIO = 4.0
 #: Smallest peak as a fraction of the record's range, which excludes a noiseless tail. Smoothing rounds the jumps of an
 #: acceleration where dry friction turns, so that small peaks remain after the rod sticks.
 PEAK_RANGE_RATIO, PEAK_RANGE_RATIO_OF_JUMPS = 0.005, 0.05
@@ -178,7 +176,7 @@ def logarithmic_decrement(
     rest = equilibrium(values)
     guide = (values if smoothed is None else smoothed) - rest
     smallest = PEAK_RANGE_RATIO_OF_JUMPS if jumps else PEAK_RANGE_RATIO
-    lowest = max(PEAK_NOISE_RATIO * noise_level(values), smallest * float(np.ptp(guide)))
+    lowest = max(SIGNIFICANT * noise_level(values), smallest * float(np.ptp(guide)))
     times, peaks = half_cycle_extremes(time, guide, values - rest, lowest)
     if len(times) < 3:
         return None
@@ -305,7 +303,7 @@ def likelihood_gain(one: ViscousFit, other: ViscousFit) -> float:
 def swings_enough(values: np.ndarray) -> bool:
     """Whether a record passes its rest position twice, or once where it then stays there."""
     size = (values - equilibrium(values)) / np.ptp(values)
-    smallest = max(SWINGING_RATIO, PEAK_NOISE_RATIO * noise_level(values) / float(np.ptp(values)))
+    smallest = max(SWINGING_RATIO, SIGNIFICANT * noise_level(values) / float(np.ptp(values)))
     swings = int(np.count_nonzero(np.diff(np.sign(size[np.abs(size) > smallest]))))
     stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SWINGING_RATIO
     # Where friction stops the rod, its two strokes show their duration and what each of them loses.

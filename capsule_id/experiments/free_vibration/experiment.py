@@ -20,23 +20,16 @@ from capsule_id.experiments.free_vibration.hidden_terms import (
 )
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
-from capsule_id.experiments.free_vibration.second_fit import (
-    SHORTEST,
-    Screening,
-    decay_starts,
-    nested_starts,
-    second_models,
-)
+from capsule_id.experiments.free_vibration.screening import Screening, decay_starts, nested_starts
+from capsule_id.experiments.free_vibration.second_fit import SHORTEST, second_models
 from capsule_id.experiments.statistics import further_columns, weighted_mean
 from capsule_id.parameters import parameter
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import sampling
-from capsule_id.records.tones import length_of_motion, other_tone
+from capsule_id.records.tones import SIGNIFICANT, VISIBLE, length_of_motion, other_tone
 from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding, Level, ResultTable
 
-#: Joint sds apart from which halves of a decay disagree or a force is seen, and from which that fails.
-DISAGREE, FAIL = 3.0, 4.0
 #: Rounding errors are no noise where all noise is below this share of the distance of levels; rounding alone is 0.29 of it.
 COARSE = 0.42
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
@@ -123,7 +116,7 @@ def halves(changes: Changes) -> Check:
         name = max(found, key=lambda name: abs(found[name][2]))
         first, second, z, matters = found[name]
         facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
-        level = "ok" if not abs(z) > DISAGREE else "fail" if abs(z) > FAIL and matters else "warn"
+        level = "ok" if not abs(z) > VISIBLE else "fail" if abs(z) > SIGNIFICANT and matters else "warn"
         return {**facts, "model": e.model_name, "stated": e.stated_words}, level
 
     return each("decays.halves", judge)
@@ -168,7 +161,7 @@ def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Find
             (symbol,),
         )
         for symbol, e in found.items()
-        if z[symbol] < DISAGREE
+        if z[symbol] < VISIBLE
     ] + [
         Finding("decays.coarse", "warn", {"label": e.label, "name": symbol, **facts}, e.label, (symbol, "c"))
         for symbol, e in found.items()

@@ -22,6 +22,7 @@ from capsule_id.experiments.free_vibration.record import Decay, DecayRecord
 from capsule_id.experiments.statistics import without
 from capsule_id.parameters import QUANTILE_975, parameter
 from capsule_id.records.release import EVIDENCE
+from capsule_id.records.tones import VISIBLE
 from capsule_id.views import Facts, Finding, Level
 
 # sensitivities: Effects of the parameters on the readings of a decay, and of forces that the fitted model lacks.
@@ -173,9 +174,8 @@ def _least_squares(known: np.ndarray, columns: np.ndarray, values: np.ndarray) -
 # the records allow, and the values beside it.
 
 
-#: Changes of c and of k1 by a force at its limit that matter: relative to the value, and in standard errors.
+#: Changes of c and of k1 by a force at its limit that matter, relative to the value, where they are ``VISIBLE`` too.
 CHANGES: Mapping[str, float] = {"c": 0.2, "k1": 0.05}
-CHANGE_IN_ERRORS = 3.0
 #: Estimates further below zero, in standard errors, count as this one.
 LOWEST = -30.0
 
@@ -250,7 +250,7 @@ def _change(name: str, value: float, terms: Mapping[str, Hidden], swings: bool) 
     for symbol, term in terms.items():
         changes = [term.slopes[name] * end for end in term.limits(symbol == "k_cubic")]
         error = term.errors[name]
-        if max(np.abs(changes)) > (max(CHANGES[name] * value, CHANGE_IN_ERRORS * error) if swings else error):
+        if max(np.abs(changes)) > (max(CHANGES[name] * value, VISIBLE * error) if swings else error):
             ends += [value + change + side * QUANTILE_975 * error for change in changes for side in (-1.0, 1.0)]
             symbols.append(symbol)
             largest.append(max(np.abs(term.limits(symbol == "k_cubic"))))

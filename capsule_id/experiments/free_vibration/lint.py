@@ -40,6 +40,7 @@ from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
+from capsule_id.rig.units import factor_to_si
 from capsule_id.views import Facts, Finding, Level, Message, filled_in
 
 # lint: Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any
@@ -61,7 +62,11 @@ FEWEST_PERIODS = 2
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
-RATIOS = (("1000 (s and ms)", PREFIX), ("60 (min and s)", 60.0), ("2 pi (rad and cycles)", 2.0 * np.pi))
+RATIOS = (
+    ("1000 (s and ms)", PREFIX),
+    ("60 (min and s)", factor_to_si("min", "s")),
+    ("2 pi (rad and cycles)", 2.0 * np.pi),
+)
 
 
 def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import RK45
 
+from capsule_id.parameters import ROUNDING, SAME
 from capsule_id.rig.filters import largest_offset
 
 # m1 x'' + c x' + F_dry sign(x') + c_q x'|x'| + k1 x + k_cubic x^3 = 0, capsule at rest, x = x_rel about its
@@ -215,6 +216,6 @@ def _series(exponent: Any, n: int) -> Any:
 
 
 def uniform_step(time: np.ndarray) -> float | None:
-    """Sampling step, s, where every sample lies on the grid to 1e-9 of a step plus file rounding; else None."""
+    """Sampling step, s, where every sample lies on the grid up to rounding of its own and of the file; else None."""
     step = float((time[-1] - time[0]) / (len(time) - 1))
-    return step if largest_offset(time, step) < 1e-9 * step + 1e-12 else None
+    return step if largest_offset(time, step) < SAME * step + ROUNDING else None

@@ -69,9 +69,9 @@ from capsule_id.experiments.free_vibration.readings import (
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
 from capsule_id.experiments.statistics import autocorrelation
-from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.parameters import STEP_SD, Parameter, Prior, parameter
 from capsule_id.records.release import shortened
-from capsule_id.records.tones import noise_level
+from capsule_id.records.tones import VISIBLE, noise_level
 from capsule_id.records.view import FILTER_ORDER
 from capsule_id.rig.filters import TIMING_TOLERANCE, choose_window, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
@@ -176,11 +176,9 @@ def averaged_process(times: ReadingTimes, correlation_time: Any) -> SymmQSM:
 UNIFORM = 0.6
 #: Latest first turning point after the first sample, in half periods.
 LATEST_TURNING_POINT = 0.1
-#: A rough viscous fit whose residuals are this many times the noise misses a force.
-MISFIT = 3.0
 #: Smallest sd of a reading with white noise, where none is stated, relative to ``width``: that of steps of 18 bits, which
 #: good converters resolve. Without noise k1/m1 would have more digits than covariances and sums of squares hold.
-FINEST = 2.0**-18 / np.sqrt(12.0) / NUISANCE_WIDTH
+FINEST = 2.0**-18 * STEP_SD / NUISANCE_WIDTH
 
 
 @dataclass(frozen=True)
@@ -530,7 +528,7 @@ class DecayRecord(Decay):
         if decrement is not None and decrement.delta > 0.0:
             return decrement
         found = viscous_fit(self.time, self.values)
-        if self.order == 0 and np.std(found.left) > MISFIT * noise_level(self.values):
+        if self.order == 0 and np.std(found.left) > VISIBLE * noise_level(self.values):  # it misses a force
             # Dry friction is a constant force up to the first turning point, where the rest of the record misleads.
             period = int(np.sum(self.time - self.time[0] < 2.0 * np.pi / found.omega))
             turn = int(np.argmax(np.abs(self.values[:period] - self.values[0])))

@@ -21,7 +21,7 @@ from capsule_id.experiments.base import (
 )
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
-from capsule_id.experiments.free_vibration.experiment import DISAGREE, FAIL, each, halves
+from capsule_id.experiments.free_vibration.experiment import each, halves
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
     check_hidden_terms,
@@ -32,10 +32,12 @@ from capsule_id.experiments.free_vibration.hidden_terms import (
 from capsule_id.experiments.free_vibration.models import half_cycles
 from capsule_id.experiments.free_vibration.readings import DecayModel, decay_window, further_parameters
 from capsule_id.experiments.free_vibration.record import Decay, DecayAbout, Screened
-from capsule_id.experiments.free_vibration.second_fit import Demanded, force_starts, replaced
+from capsule_id.experiments.free_vibration.screening import force_starts
+from capsule_id.experiments.free_vibration.second_fit import Demanded, replaced
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
-from capsule_id.parameters import Prior, parameter
+from capsule_id.parameters import STEP_SD, Prior, parameter
+from capsule_id.records.tones import SIGNIFICANT, VISIBLE
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Facts, Finding, Level
 
@@ -203,7 +205,7 @@ def check_steps(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding]
         )
         for e in tables
         for name, symbol, told, step in zip(("x_rel", "time"), e.scatters, ("c", "k1"), e.steps, strict=True)
-        if e.local(fit.values)[symbol] < step / np.sqrt(12.0)
+        if e.local(fit.values)[symbol] < step * STEP_SD
     ]
 
 
@@ -216,7 +218,7 @@ def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Level] | N
     key = "stiffness" if best["name"] == "k_cubic" else "damping"
     line = e.model.with_force(best["name"]).lines(key)
     facts = {**best, "line": line, "model": e.model.name, "one_side": not e.both_sides}
-    return facts, "ok" if best["z"] <= DISAGREE else "fail" if best["z"] > FAIL and best["moved"] else "warn"
+    return facts, "ok" if best["z"] <= VISIBLE else "fail" if best["z"] > SIGNIFICANT and best["moved"] else "warn"
 
 
 check_forces, check_halves = each("decays.forces", forces), halves(changes_of_second_half)
@@ -224,7 +226,7 @@ check_forces, check_halves = each("decays.forces", forces), halves(changes_of_se
 
 # second fit: Choice of the forces of turning points where the readings contradict the stated ones.
 #
-# A force is added where the readings demand it by ``FAIL`` sds and exclude every other one in its place. Amplitudes
+# A force is added where the readings demand it by ``SIGNIFICANT`` sds and exclude every other one in its place. Amplitudes
 # of one side must also exclude that they are counted from another place than the rest position.
 
 
@@ -250,7 +252,7 @@ def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, str, float]
         symbols, cubic = open_forces(e), e.table.settings.offers_cubic
         theta = fitted(e) if symbols else {}
         z = {symbol: one["z"] for symbol in symbols if (one := further_force(e, theta, symbol))}
-        offered = [symbol for symbol in z if z[symbol] > FAIL and (cubic or symbol != "k_cubic")]
+        offered = [symbol for symbol in z if z[symbol] > SIGNIFICANT and (cubic or symbol != "k_cubic")]
         best = max(offered, key=lambda symbol: z[symbol], default="")
         rivals = (symbol for symbol in z if symbol != best and z[symbol] > RIVAL)
         others = (e.with_model(e.model.with_force(symbol)) for symbol in rivals)
@@ -263,7 +265,7 @@ def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, str, float]
 def _demands(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset: bool = False) -> bool:
     """Whether the readings demand the force with the parameter ``symbol`` at the fit ``theta``."""
     force = further_force(e, theta, symbol, offset)
-    return force is not None and force["z"] > DISAGREE
+    return force is not None and force["z"] > VISIBLE
 
 
 # experiment: Turning points of a free decay, read one by one: times and positions (``samples = "turning_points"``).
@@ -313,8 +315,7 @@ class TurningPoints(Decay):
         columns = [table.columns[name] for name in ("x_rel", "time")]
         self.steps = tuple(column.unstated_step for column in columns)
         errors = [
-            float(np.hypot(column.reading_sd, step / np.sqrt(12.0)))
-            for column, step in zip(columns, self.steps, strict=True)
+            float(np.hypot(column.reading_sd, step * STEP_SD)) for column, step in zip(columns, self.steps, strict=True)
         ]
         self.reading_sd, self.time_reading_sd = errors
         self.clock_rate = stated_rate(table)

@@ -18,6 +18,7 @@ from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.misfit import LOG_2PI, Misfit
 from capsule_id.experiments.progression.declaration import SESSIONS, alternatives
 from capsule_id.physics.batches import array_module, pool
+from capsule_id.records.tones import VISIBLE
 
 # sessions: Sessions of a progression: how the friction of each one enters, and the runs of the capsule that follow.
 #
@@ -292,8 +293,6 @@ class RunEmulator(eqx.Module):
 DISCREPANCIES = 13
 #: Groups of cases: of a known session, and of sessions that are integrated out, see ``TrialGroups.members``.
 KNOWN, LONE, SHARED = range(3)
-#: Within these z a line may explain the readings, for the variance of a trial that depends on its displacement.
-FARTHEST_Z = 3.0
 
 
 class TrialGroups(eqx.Module):
@@ -450,7 +449,7 @@ class TrialMisfit:
     def _of_lone_sessions(self, member: int, scatter: Any, discrepancy: tuple[Any, Any], xp: ModuleType) -> Any:
         """(scatter, alternatives) density of the trials whose z is integrated out.
 
-        The variance of a trial is taken where its line is nearest to the mean of the trials.
+        The variance of a trial is taken where its line is nearest to the mean of the trials, at usual z.
 
         Parameters
         ----------
@@ -462,7 +461,7 @@ class TrialMisfit:
         nodes, chosen = (NODES, slice(None)) if shared else (NODES[INNER], INNER)
         X2, y, trials, count, spread, measure, owner = self._cases(member, xp)
         start, slope = lines(X2[:, chosen], nodes, xp)
-        low, high = (start + slope * np.clip(z, -FARTHEST_Z, FARTHEST_Z)[None] for z in edges(nodes))
+        low, high = (start + slope * np.clip(z, -VISIBLE, VISIBLE)[None] for z in edges(nodes))
         nearest = xp.clip(y[:, None], xp.minimum(low, high), xp.maximum(low, high))
         # Axes: scatter, case, line, discrepancy.
         v = (self.reading_variance + (self.trial_scatter * nearest[None]) ** 2 + scatter**2)[..., None]

@@ -37,11 +37,10 @@ from capsule_id.experiments.progression.density import (
 )
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import array_module
-from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import FrictionLaw, equilibrium, scaled
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, without_absent
-from capsule_id.physics.simulation import simulate
+from capsule_id.physics.simulation import displacement, simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable

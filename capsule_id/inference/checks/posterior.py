@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from capsule_id.experiments.base import LEVEL, Experiment
 from capsule_id.experiments.lint import wrong_prefix
-from capsule_id.experiments.statistics import TIE, basis_of
+from capsule_id.experiments.statistics import basis_of
 from capsule_id.inference.checks.settings import SMALLEST_SCATTER, design
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.moves import geyer_size
@@ -20,7 +20,7 @@ from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.prediction import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.result import PointFit, Pointwise, Posterior
 from capsule_id.inference.target import LogPosterior, prior_of
-from capsule_id.parameters import Parameter, is_stated
+from capsule_id.parameters import SAME, Parameter, is_stated
 from capsule_id.views import Finding
 
 # agreement: Check that forced runs and bench tests give consistent parameters.
@@ -416,7 +416,7 @@ def p_values(residuals: np.ndarray, columns: np.ndarray) -> dict[str, float]:
     for name, statistic in STATISTICS.items():
         scale = spread if name == "largest" else 1.0
         here, there = statistic(seen / scale)[0], statistic(drawn / scale)
-        tie = TIE * max(1.0, abs(here))
+        tie = SAME * max(1.0, abs(here))
         larger, equal = np.sum(there > here + tie), np.sum(np.abs(there - here) <= tie)
         found[name] = float((0.5 + larger + 0.5 * equal) / (1 + number))
     return found

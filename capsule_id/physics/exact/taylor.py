@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.experimental.jet import jet
 
 from capsule_id.errors import InputError
+from capsule_id.parameters import SAME
 from capsule_id.physics.forces import (
     DEGREE,
     Force,
@@ -375,14 +376,12 @@ def advance(constants: Constants, state: CapsuleState, step: StepSeries, s: jax.
 
 # Kinds of events; that of contact i is GAP + i.
 NONE, VELOCITY, UPPER, LOWER, SWITCH, GAP = range(6)
-# The march arrives when its next leap is this small a part of the step, or, at a root that is crossed at a definite
-# rate, when a leap below SURE_LEAP agrees with Newton's to SURE_AGREEMENT: the correction in ``correct`` does the rest.
-LEAP_TOLERANCE = 1e-9
+# The march arrives when its next leap is only ``SAME`` of the step, or, at a root that is crossed at a definite rate, when
+# a leap below SURE_LEAP agrees with Newton's to SURE_AGREEMENT: the correction in ``correct`` does the rest. An event is met
+# at a fraction of the step no smaller than ``SAME``, so that time always goes on; ``correct`` steps back.
 SURE_LEAP, SURE_AGREEMENT = 1e-3, 1e-4
 # Leaps on one step. Where they do not suffice (a root closely missed) the step ends early, with nothing lost.
 MAX_LEAPS = 100
-# An event is met at a fraction of the step no smaller than this, so that time always goes on; ``correct`` steps back.
-SMALLEST_FRACTION = 1e-9
 # Coefficients of an event function below this part of its size are rounding, where only their sign would matter.
 ROUNDING_NOISE = 1e-14
 # |f| within this many roundings of the break-away force counts as at the threshold; the rate of |f| then decides.
@@ -483,7 +482,7 @@ def first_event(
             to_gap = _leap(g0, g1, gap.rest - gap.p2)
             is_gap, tau = to_gap <= tau, jnp.minimum(to_gap, tau)
             sure, which = jnp.where(is_gap, _sure(g0, g1, tau), sure), jnp.where(is_gap, gap_kind, which)
-        arrived = tau <= jnp.where(sure, SURE_LEAP, LEAP_TOLERANCE) * s_end
+        arrived = tau <= jnp.where(sure, SURE_LEAP, SAME) * s_end
         kind = jnp.where(going & arrived, which, kind)
         onward = s + tau
         return (
@@ -495,7 +494,7 @@ def first_event(
 
     start = (jnp.zeros_like(s_end), jnp.zeros(s_end.shape, jnp.int32), active, jnp.int32(0))
     s, kind, _, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[2]) & (carry[3] < MAX_LEAPS), leap, start)
-    return jnp.clip(s, SMALLEST_FRACTION * s_end, s_end), kind
+    return jnp.clip(s, SAME * s_end, s_end), kind
 
 
 def motion_at(constants: Constants, state: CapsuleState, mode: Mode, kind: jax.Array) -> jax.Array:
