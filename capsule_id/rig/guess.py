@@ -407,8 +407,11 @@ def _headers(export: Export, dimensions: Sequence[str]) -> tuple[tuple[str, ...]
     rows = list(export.headers[:3])
     units = next((row for row in rows if is_units_row(row, dimensions)), None)
     names = next((row for row in rows if row is not units), None)
+    if units is not None and rows[-1] is not units:  # comments may stand below the units, names stand above them
+        names = rows[rows.index(units) + 1]
     if names is None and units is not None:  # the only row of headers is a row of units, or of short names
-        return units, empty
+        known = {word for words in WORDS.values() for word in words}
+        return units, tuple("" if _bare(cell) in known else cell.strip(" []()") for cell in units)
     return names or empty, tuple(cell.strip(" []()") for cell in units) if units is not None else empty
 
 

@@ -25,6 +25,12 @@ from capsule_id.views import counted
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
+#: A number whose thousands are separated; by decimal mark, one that shows by which mark they are.
+_GROUPED = re.compile("[+-]?[1-9][0-9]{0,2}(?P<mark>[.,'\u2019 \u00a0\u202f])[0-9]{3}(?:(?P=mark)[0-9]{3})*(?:[.,][0-9]*)?")
+_APART = {
+    mark: re.compile(rf"(?m)^[+-]?[1-9][0-9]{{0,2}}(?:(?:{other}[0-9]{{3}})+[{mark}]|(?:{other}[0-9]{{3}}){{2,}}$)")
+    for mark, other in ((",", "[.]"), (".", ","))
+}
 # Only with such an exponent may a number be below the smallest float64: its cells are then read one by one.
 _TINY = re.compile("[eE]-0*(?:[1-9][0-9]{3}|[3-9][0-9]{2})")
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
@@ -64,8 +70,14 @@ def bare(cell: str) -> str:
     return cell.strip(BLANKS).strip('"')
 
 
-def number_in(cell: str, decimal: str) -> float | None:
-    """The number in a cell with the decimal mark ``decimal``, None if it is no plain number."""
+def number_in(cell: str, decimal: str, apart: bool = False) -> float | None:
+    """The number in a cell with the decimal mark ``decimal``, None if it is no plain number.
+
+    Its thousands may be separated; by a point or a comma alone only where it is known that they are ``apart``: 1,234.
+    """
+    if (found := _GROUPED.fullmatch(cell)) and (mark := found["mark"]) != decimal:
+        sure = apart or mark not in ".," or decimal in cell or cell.count(mark) > 1
+        cell = cell.replace(mark, "") if sure else cell
     written = cell.translate(_SWAP_MARKS) if decimal == "," else cell
     return None if _NUMBER.fullmatch(written) is None else float(written)
 
@@ -107,9 +119,15 @@ def is_beyond_floats(value: float, written: str) -> bool:
 
 
 def decimal_mark(texts: Sequence[str], missing: Sequence[str]) -> str | None:
-    """The first point or comma of the cells of a column, None where they have none."""
-    found = re.search("[.,]", "\n".join(text for text in texts if text not in missing))
-    return found[0] if found else None
+    """The first point or comma of the cells of a column that separates no thousands, None where they have none."""
+    written = "\n".join(text for text in texts if text not in missing)
+    found = re.search("[.,]", written)
+    return next(mark_apart(written), found[0] if found else None)
+
+
+def mark_apart(written: str) -> Iterator[str]:
+    """The decimal mark of lines with numbers such as 1.234,5 or 1,234,567, which show how their thousands are separated."""
+    return (mark for mark, pattern in _APART.items() if pattern.search(written))
 
 
 def read_column(
@@ -141,10 +159,11 @@ def read_column(
             values[used] = [float(texts[k].replace(mark, ".")) for k in used]
             if np.isfinite(values[used]).all() and (values[used].all() or not _TINY.search("\n".join(texts))):
                 return values
+    apart = mark in mark_apart("\n".join(texts))
     for k, text in enumerate(texts):
         if text in missing:
             continue
-        value = number_in(text, mark)
+        value = number_in(text, mark, apart)
         if value is None:
             raise InputError(
                 "a cell must be a number",
