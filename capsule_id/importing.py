@@ -37,7 +37,7 @@ from capsule_id.rig.guess import (
 )
 from capsule_id.rig.schema import SHORTEST_RECORD, QuantityRule
 from capsule_id.rig.times import evened
-from capsule_id.rig.units import UNKNOWN, factor_to_si
+from capsule_id.rig.units import SIGNALS, UNKNOWN, factor_to_si, symbol_named
 from capsule_id.views import counted
 
 # guess: Guesses the kind of experiment of an export, and which of its columns and units are those of the kind.
@@ -512,7 +512,9 @@ def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
     for name, column in guessed.columns.items():
         for each in (column, *column.rivals):
             factor = "" if each.scale is None else f", scale = {each.scale:.10g}"
-            source = f'{{ from = {source_of(found, each.index)}, unit = "{each.unit}"{factor} }}'
+            signal = symbol_named(found.header(each.index, ["s"])[1])  # check then asks for the sensitivity
+            unit = signal if each.unit == UNKNOWN and signal in SIGNALS else each.unit
+            source = f'{{ from = {source_of(found, each.index)}, unit = "{unit}"{factor} }}'
             reason = column.reason if each is column else "or this one"
             yield _commented(f"{'# ' * column.asked}{name} = {source}", column.confidence, reason)
 

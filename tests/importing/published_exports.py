@@ -255,3 +255,33 @@ EXPORTS = [
           {"time": (1e3 * T, "ms", 1e-9), "x_rel": (np.round(1e3 * DRIVEN, 1), "um", 0.1),
            "current": (np.round(CURRENT, 1), "mA", 0.1)}, encoding="utf-8-sig"),
 ]  # fmt: skip
+
+
+VOLTS, NO_UNIT = "a reading in V needs the sensitivity of its sensor", "state the unit of the column, which the file does not"
+FACTOR = 'from = "Volt", unit = "mm", scale = 0.5'
+
+
+def _volts(scale: float = 2.0) -> np.ndarray:
+    """The decay as a laser with 2 V per mm shows it, V."""
+    return np.round(X * scale, 4)
+
+
+#: Records of oscilloscopes and sound cards, in V or counts: the sensor decides what they mean. The edits that complete
+#: their entries: what the error asks for, and what replaces it.
+SIGNALS = [
+    ("Keysight InfiniiVision User's Guide, CSV data files", "keysight.csv", "x-axis,1\nsecond,Volt\n"
+     + rows(",", numbers(T, "{:+.5E}"), numbers(_volts(), "{:+.5E}")), ((VOLTS, 'from = "Volt", unit = "V"', FACTOR),)),
+    ("Tektronix TBS1000 User Manual, CSV: settings beside the first rows", "tek.csv",
+     rows(",", *(["Record Length", "Sample Interval", "Trigger Point", "Source", "Vertical Units", "Vertical Scale",
+                  *[""] * (N - 6)], ["1.000000e+03", "1.000000e-03", "0.00e+00", "CH1", "V", "2.0e+00", *[""] * (N - 6)],
+                 [""] * N, numbers(T, "{:013.9f}"), numbers(_volts(), "{:.5f}"), [""] * N)),
+     ((NO_UNIT, 'from = 5, unit = "?"', FACTOR.replace('"Volt"', "5")), (NO_UNIT, 'from = 4, unit = "?"', 'from = 4, unit = "s"'))),
+    ("Rigol DS1000Z User's Guide, CSV: samples and their increment", "rigol.csv", "X,CH1,Start,Increment,\n"
+     "Sequence,Volt,0.000000e+00,1.000000e-03\n" + rows(",", [str(k) for k in range(N)], numbers(_volts(), "{:.4e}"),
+                                                       [""] * N),
+     ((NO_UNIT, 'from = 2, unit = "?"', FACTOR.replace('"Volt"', "2")), (NO_UNIT, 'from = 1, unit = "?"', 'from = 1, unit = "ms"'))),
+    ("Audacity manual, Sample Data Export, linear, with header", "audacity.txt",
+     "decay   1 channel (mono)\nSample Rate: 1000 Hz. Sample values on linear scale.\nLength processed: 1000 samples "
+     "1.00000 seconds.\n\n" + rows("\n", numbers(X / 4, "{:.5f}")),
+     ((NO_UNIT, 'from = 1, unit = "?"', 'from = 1, unit = "mm", scale = 4'),)),
+]  # fmt: skip

@@ -10,7 +10,7 @@ from capsule_id.api import fit, read_rig
 from capsule_id.experiments.kind import default_registry
 from capsule_id.rig.units import factor_to_si
 from tests.cli_tools import message
-from tests.importing.published_exports import EXPORTS, K1, SIGNALS, Written
+from tests.importing.published_exports import EXPORTS, K1, SIGNALS, Written, X
 
 KINDS = default_registry()
 #: Rows of the table in the core, and those that are fitted.
@@ -44,6 +44,31 @@ def test_the_table_is_what_it_says() -> None:
 def test_an_export_enters_without_an_edit(one: Written, tmp_path: Path) -> None:
     entered(one, tmp_path)
     if one.file in FITTED:
-        k1 = fit(tmp_path / "rig", sample=False)["k1"]
+        k1 = fit(tmp_path / "rig", budget=None)["k1"]
         assert abs(k1.value - K1) < 3.0 * k1.sd
         assert k1.sd < 5.0
+
+
+@pytest.mark.parametrize(("source", "file", "text", "edits"), SIGNALS, ids=[row[1] for row in SIGNALS])
+def test_a_signal_is_refused_until_its_sensitivity_is_stated(
+    source: str,
+    file: str,
+    text: str,
+    edits: tuple[tuple[str, str, str], ...],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The file cannot say how many mm a volt is; the entry is right but for that, and each remedy works when followed."""
+    (tmp_path / file).write_text(text, encoding="utf-8")
+    assert cli.capsule_id(["init", str(tmp_path / "rig"), *MASSES, "--from", str(tmp_path / file)]) == 0, source
+    capsys.readouterr()
+    toml = tmp_path / "rig" / "rig.toml"
+    for said, old, new in edits:
+        assert cli.capsule_id(["check", str(tmp_path / "rig")]) == 2
+        assert said in message(capsys.readouterr().err)
+        entry = toml.read_text(encoding="utf-8")
+        assert old in entry
+        toml.write_text(entry.replace(old, new), encoding="utf-8")
+    (table,) = read_rig(tmp_path / "rig").tables
+    np.testing.assert_allclose(table["x_rel"], 1e-3 * X, rtol=0, atol=4e-8)
+    np.testing.assert_allclose(np.diff(table["time"]), 1e-3)
