@@ -21,6 +21,7 @@ from scipy.io import savemat
 
 RNG = np.random.default_rng(43)
 M1, K1, C = 0.110, 1420.0, 1.4  # kg, N/m, N s/m
+MASSES = ("--m1", "110", "0.1", "g", "--m2", "530", "1", "g")  # options of init
 RATE, N = 1000.0, 1000  # Hz, samples
 T = np.arange(N) / RATE
 _RATE_OF_DECAY = C / (2 * M1)

@@ -10,14 +10,13 @@ from capsule_id.api import fit, read_rig
 from capsule_id.experiments.kind import default_registry
 from capsule_id.rig.units import factor_to_si
 from tests.cli_tools import message
-from tests.importing.published_exports import EXPORTS, K1, SIGNALS, Written, X
+from tests.importing.published_exports import EXPORTS, K1, MASSES, SIGNALS, Written, X
 
 KINDS = default_registry()
 #: Rows of the table in the core, and those that are fitted.
 CORE = {"versuch.tdms", "run.txt", "excel_us.csv", "monitor.txt", "pushes.txt"}
 FITTED = {"run.txt", "stempel.tdms", "excel_us.csv", "decay.csv"}
 CASES = [pytest.param(one, id=one.file, marks=[] if one.file in CORE else pytest.mark.full) for one in EXPORTS]
-MASSES = ("--m1", "110", "0.1", "g", "--m2", "530", "1", "g")
 
 
 def entered(one: Written, folder: Path) -> None:

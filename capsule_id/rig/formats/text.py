@@ -27,6 +27,9 @@ BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an e
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
 #: A number whose thousands are separated; by decimal mark, one that shows by which mark they are.
 _GROUPED = re.compile("[+-]?[1-9][0-9]{0,2}(?P<mark>[.,'\u2019 \u00a0\u202f])[0-9]{3}(?:(?P=mark)[0-9]{3})*(?:[.,][0-9]*)?")
+_SHORT = re.compile("[+-]?[0-9]{1,3}")
+#: Cells such as 1,234 among which whole numbers show that their comma separates thousands.
+FEWEST_APART = 20
 _APART = {
     mark: re.compile(rf"(?m)^[+-]?[1-9][0-9]{{0,2}}(?:(?:{other}[0-9]{{3}})+[{mark}]|(?:{other}[0-9]{{3}}){{2,}}$)")
     for mark, other in ((",", "[.]"), (".", ","))
@@ -390,7 +393,7 @@ def rows_of(
     """
     rows = Rows({column: [] for column in columns}, {column: [] for column in words})
     markers, marks = missing or (), dict.fromkeys(columns, shape.decimal)
-    alone = not words and are_words(markers)
+    alone, apart = not words and are_words(markers), None
     for number, block in file.blocks(shape.first):
         # No other decimal mark than that of the reader in C can be meant.
         plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
@@ -408,8 +411,10 @@ def rows_of(
             continue
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         turned = [*zip(*cells, strict=True)] or [()] * shape.width
+        apart = (_apart(turned, markers) if shape.decimal is None else {}) if apart is None else apart
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
+            texts = [text.replace(apart[column], "") for text in texts] if column in apart else texts
             if column in words:
                 rows.texts[column] += map(sys.intern, texts)
             marks[column] = marks[column] or decimal_mark(texts, markers)
@@ -423,6 +428,22 @@ def rows_of(
             except InputError as error:
                 rows.numbers[column].append(error)
     return rows
+
+
+def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str]) -> dict[int, str]:
+    """The point or the comma between thousands, by column, where all cells with it may be such numbers: 1,234 and 998.
+
+    Other columns show the other mark, or many cells with it stand beside whole numbers of three digits at most.
+    """
+    marks, lone = dict[int, str](), dict[int, bool]()
+    for k, texts in enumerate(columns):
+        if (mark := decimal_mark(texts := [bare(text) for text in texts], missing)) is not None:
+            marked, marks[k] = [text for text in texts if mark in text], mark
+            whole = len(marked) >= FEWEST_APART and any(_SHORT.fullmatch(text) for text in texts)
+            if all((found := _GROUPED.fullmatch(text)) and text[-4] == found["mark"] for text in marked):
+                lone[k] = whole
+    shown = {mark for k, mark in marks.items() if k not in lone}
+    return {k: marks[k] for k, whole in lone.items() if whole or shown == {*",."} - {marks[k]}}
 
 
 def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:

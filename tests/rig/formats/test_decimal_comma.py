@@ -73,7 +73,13 @@ def test_points_or_commas_separate_thousands_where_a_cell_shows_it(tmp_path: Pat
 
     (table,) = rig_of(tmp_path, text("999,5", "1.000", "1.001,5"), lines).tables
     np.testing.assert_allclose(table["x_rel"][:3], [0.9995, 1.0, 1.0015])
-    (table,) = rig_of(tmp_path, text("1.234", "1.235"), lines).tables
-    np.testing.assert_allclose(table["x_rel"][:2], [1.234e-3, 1.235e-3])
+    alone = {"x.csv": "".join(f"{k};{1 + k / 100:.3f}\n" for k in range(12))}
+    (table,) = rig_of(tmp_path, alone, lines).tables
+    np.testing.assert_allclose(table["x_rel"][:2], [1e-3, 1.01e-3])
     for cells in (("0.5", "1,234"), ("999,5", "1.234"), ("1,5", "1,234.5,6")):
         assert "must be a number" in fault_of(tmp_path, text(*cells), lines).rule
+    # Another column shows the decimal mark, or whole numbers stand among many of three decimals.
+    for cells in ({f"{k / 8:.3f};{1000 + k:,}" for k in range(30)}, {f"{k};{985 + k:,}" for k in range(60)}):
+        ordered = sorted(cells, key=lambda row: float(row.split(";")[0]))
+        (table,) = rig_of(tmp_path, {"x.csv": "\n".join(ordered) + "\n"}, lines).tables
+        assert 0.98 < table["x_rel"].min() <= table["x_rel"].max() < 1.06
