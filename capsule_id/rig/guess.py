@@ -544,6 +544,16 @@ def times_of(found: FoundLayout) -> list[int]:
     return [index for index in named if increases(found.columns[index])]
 
 
+def times_of_trace(found: FoundLayout, kind: KindRule) -> list[int]:
+    """Columns of times of a file that is a record in time, where a row of ``kind`` is a trial, which is read off a record.
+
+    A reading of a calibration is a row of a record.
+    """
+    rules = kind.columns.values()
+    long = [index for index in times_of(found) if len(found.columns[index]) >= FEWEST_SAMPLES]
+    return [] if TIME in kind.columns or any(rule.varies for rule in rules) else long
+
+
 def is_constant(found: FoundLayout, index: int) -> bool:
     """Whether a column of several rows is the same in all of them."""
     return len(values := found.columns[index]) > 1 and bool(np.nanmax(values) == np.nanmin(values))
@@ -611,10 +621,7 @@ def proposal(kind: KindRule, found: FoundLayout | None) -> str:
     best, record = Assignment(kind, {}, 0.0, kind.sets[0], kind.channels[:1]), False
     if found is not None:
         best = max(assignments(found, kind), key=lambda one: (-len(one.missing), one.score))
-        # A reading of a calibration is a row of a record; a trial is not.
-        record = not any(rule.varies for rule in kind.columns.values()) and any(
-            len(found.columns[index]) >= FEWEST_SAMPLES for index in times_of(found)
-        )
+        record = bool(times_of_trace(found, kind))
     texts, words = [], []
     for name in dict.fromkeys((*best.wanted, *best.columns, *best.missing)):
         column = best.columns.get(name)

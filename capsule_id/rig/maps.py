@@ -310,8 +310,8 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
         example = propose(layout)
         node.table(example)
         raise node.error("a column map must have columns", "none", f"write {example}")
-    # Plateaus are readings of a time trace, whatever the columns of the kind.
-    rules = {**({"time": ColumnRule("s")} if "plateaus" in entry else {}), **kind.columns}
+    # Plateaus are readings of a time trace, whatever the columns of the kind; without them a trace is refused as such.
+    rules = {"time": ColumnRule("s"), **kind.columns}
     node.refuse_unknown(tuple(rules))
     sources = {name: _source(node[name], rules[name]) for name in node.value}
     where = entry.get("where", {}).table("where = { <header> = <value> }")
