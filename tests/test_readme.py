@@ -86,9 +86,17 @@ def own_record(file: str, header: str, readings: list[str], k1: float, c: float,
     if file != GERMAN:
         return f"{header}\n" + "".join(f"{t:.4f},{x:.4f}\n" for t, x in zip(time, x_rel, strict=True))
     stamps = [datetime(2024, 3, 1, 12, 34, 56, 789000) + timedelta(seconds=float(t)) for t in time]
-    cells = zip((f"{at:%H:%M:%S,%f}"[:-3] for at in stamps), (f"{1e3 * x:.1f}".replace(".", ",") for x in x_rel), strict=True)
+    cells = zip(
+        (f"{at:%H:%M:%S,%f}"[:-3] for at in stamps), (f"{1e3 * x:.1f}".replace(".", ",") for x in x_rel), strict=True
+    )
     rows = [f"{stamp};{x};{'Stoß' * (k == 700)}" for k, (stamp, x) in enumerate(cells)]
-    titles = ["Ausschwingversuch 3", "Prüfer: K. Weiß; Ort: Labor 2", "Abtastrate 1000 Hz", "", "Uhrzeit;Weg (µm);Bemerkung"]
+    titles = [
+        "Ausschwingversuch 3",
+        "Prüfer: K. Weiß; Ort: Labor 2",
+        "Abtastrate 1000 Hz",
+        "",
+        "Uhrzeit;Weg (µm);Bemerkung",
+    ]
     return "\r\n".join([*titles, *rows, ""])
 
 

@@ -139,7 +139,10 @@ OPTIONS = {
             "exports of loggers and programs: copy them into DIR and guess the entries that read them",
             {"dest": "files", "nargs": "+", "type": Path, "default": []},
         ),
-        *((f"--{m}", ("VALUE", "SD", "UNIT"), f"mass of the {part}: 110 0.5 g", {"nargs": 3}) for m, part in _MASSES.items()),
+        *(
+            (f"--{m}", ("VALUE", "SD", "UNIT"), f"mass of the {part}: 110 0.5 g", {"nargs": 3})
+            for m, part in _MASSES.items()
+        ),
     )
 }
 
@@ -198,5 +201,9 @@ def run(args: argparse.Namespace) -> int:
         f"{file}: {'kind unsure' if guessed is None else guessed.kind}{', unsure' if guessed and guessed.unsure else ''}"
         for file, (_, guessed) in guesses.items()
     ]
-    say("\n".join([*lines, f"check its guesses, {'' if masses else 'state the masses, '}then run capsule-id check {folder}"]))
+    say(
+        "\n".join(
+            [*lines, f"check its guesses, {'' if masses else 'state the masses, '}then run capsule-id check {folder}"]
+        )
+    )
     return 0

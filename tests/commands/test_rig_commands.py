@@ -186,7 +186,13 @@ def test_init_states_the_masses(tmp_path: Path) -> None:
     text = (tmp_path / "a" / "rig.toml").read_text()
     assert '\nm1 = { value = 110, sd = 0.5, unit = "g" }\n' in text
     assert '\nm2 = { value = 0.53, sd = 0, unit = "kg" }\n' in text
-    for words in (("heavy", "1", "g"), ("110", "0.5", "mm"), ("-1", "0", "kg"), ("1", "2", "kg"), ("1 }\nx = 1", "0", "g")):
+    for words in (
+        ("heavy", "1", "g"),
+        ("110", "0.5", "mm"),
+        ("-1", "0", "kg"),
+        ("1", "2", "kg"),
+        ("1 }\nx = 1", "0", "g"),
+    ):
         with pytest.raises(InputError):
             call(init, str(tmp_path / "b"), "--m1", *words)
     assert not (tmp_path / "b").exists()

@@ -26,7 +26,9 @@ RATE, N = 1000.0, 1000  # Hz, samples
 T = np.arange(N) / RATE
 _RATE_OF_DECAY = C / (2 * M1)
 #: A free decay from rest, mm.
-X = 3.6 * np.exp(-_RATE_OF_DECAY * T) * np.cos(np.sqrt(K1 / M1 - _RATE_OF_DECAY**2) * T) + 0.004 * RNG.standard_normal(N)
+X = 3.6 * np.exp(-_RATE_OF_DECAY * T) * np.cos(np.sqrt(K1 / M1 - _RATE_OF_DECAY**2) * T) + 0.004 * RNG.standard_normal(
+    N
+)
 #: A driven run: relative displacement, mm, and current, mA.
 DRIVEN = 1.5 * np.cos(34.56 * T) + 0.2 * np.cos(3 * 34.56 * T) + 0.004 * RNG.standard_normal(N)
 CURRENT = 1800.0 * np.cos(34.56 * T + 0.3)
@@ -63,7 +65,9 @@ class Written:
     own: bool = False
 
 
-def numbers(values: Sequence[float] | np.ndarray, form: str = "{:.6f}", decimal: str = ".", group: str = "") -> list[str]:
+def numbers(
+    values: Sequence[float] | np.ndarray, form: str = "{:.6f}", decimal: str = ".", group: str = ""
+) -> list[str]:
     """Texts of the numbers; ``group`` separates thousands in ``{:,}``."""
     marks = str.maketrans({",": group, ".": decimal})
     return [form.format(value).translate(marks) for value in values]
@@ -73,8 +77,18 @@ def rows(separator: str, *columns: Sequence[str], end: str = "\n") -> str:
     return "".join(separator.join(row) + end for row in zip(*columns, strict=True))
 
 
-def decay(source: str, file: str, content: str | bytes, digits: int = 4, unit: str = "mm", step: float = 1e-6, *,
-          encoding: str = "utf-8", own: bool = False, time: tuple[np.ndarray, str] = (T, "s")) -> Written:
+def decay(
+    source: str,
+    file: str,
+    content: str | bytes,
+    digits: int = 4,
+    unit: str = "mm",
+    step: float = 1e-6,
+    *,
+    encoding: str = "utf-8",
+    own: bool = False,
+    time: tuple[np.ndarray, str] = (T, "s"),
+) -> Written:
     """A free decay with ``digits`` digits behind the point in ``unit``; the last digit of the times is ``step`` s."""
     factor = {"mm": 1.0, "um": 1e3, "m": 1e-3, "cm": 0.1, "in": 1 / 25.4}[unit]
     raw = content if isinstance(content, bytes) else content.encode(encoding)
@@ -82,8 +96,16 @@ def decay(source: str, file: str, content: str | bytes, digits: int = 4, unit: s
     return Written(source, file, raw, "free_vibration", columns, own)
 
 
-def table(source: str, file: str, content: str | bytes, kind: str, columns: Mapping[str, Truth], *,
-          encoding: str = "utf-8", own: bool = False) -> Written:
+def table(
+    source: str,
+    file: str,
+    content: str | bytes,
+    kind: str,
+    columns: Mapping[str, Truth],
+    *,
+    encoding: str = "utf-8",
+    own: bool = False,
+) -> Written:
     raw = content if isinstance(content, bytes) else content.encode(encoding)
     return Written(source, file, raw, kind, columns, own)
 
@@ -170,7 +192,12 @@ def _lvm() -> str:
     head += ["Multi_Headings\tYes", "X_Columns\tOne", "Time_Pref\tRelative", "Operator\tLabor", "Date\t2024/03/01"]
     head += ["Time\t12:34:56,789", "***End_of_Header***\t", "\t", "Channels\t1\t\t", f"Samples\t{N}\t\t"]
     head += ["Date\t2024/03/01\t\t", "Time\t12:34:56,789\t\t", "Y_Unit_Label\tmm\t\t", "X_Dimension\tTime\t\t"]
-    head += ["X0\t0,0000000000000000E+0\t\t", "Delta_X\t0,001000\t\t", "***End_of_Header***\t\t\t", "X_Value\tWeg\tComment"]
+    head += [
+        "X0\t0,0000000000000000E+0\t\t",
+        "Delta_X\t0,001000\t\t",
+        "***End_of_Header***\t\t\t",
+        "X_Value\tWeg\tComment",
+    ]
     return "\n".join(head) + "\n" + rows("\t", numbers(T, decimal=","), numbers(X, decimal=","))
 
 
@@ -258,7 +285,10 @@ EXPORTS = [
 ]  # fmt: skip
 
 
-VOLTS, NO_UNIT = "a reading in V needs the sensitivity of its sensor", "state the unit of the column, which the file does not"
+VOLTS, NO_UNIT = (
+    "a reading in V needs the sensitivity of its sensor",
+    "state the unit of the column, which the file does not",
+)
 FACTOR = 'from = "Volt", unit = "mm", scale = 0.5'
 
 
@@ -276,11 +306,13 @@ SIGNALS = [
      rows(",", *(["Record Length", "Sample Interval", "Trigger Point", "Source", "Vertical Units", "Vertical Scale",
                   *[""] * (N - 6)], ["1.000000e+03", "1.000000e-03", "0.00e+00", "CH1", "V", "2.0e+00", *[""] * (N - 6)],
                  [""] * N, numbers(T, "{:013.9f}"), numbers(_volts(), "{:.5f}"), [""] * N)),
-     ((NO_UNIT, 'from = 5, unit = "?"', FACTOR.replace('"Volt"', "5")), (NO_UNIT, 'from = 4, unit = "?"', 'from = 4, unit = "s"'))),
+     ((NO_UNIT, 'from = 5, unit = "?"', FACTOR.replace('"Volt"', "5")),
+      (NO_UNIT, 'from = 4, unit = "?"', 'from = 4, unit = "s"'))),
     ("Rigol DS1000Z User's Guide, CSV: samples and their increment", "rigol.csv", "X,CH1,Start,Increment,\n"
      "Sequence,Volt,0.000000e+00,1.000000e-03\n" + rows(",", [str(k) for k in range(N)], numbers(_volts(), "{:.4e}"),
                                                        [""] * N),
-     ((NO_UNIT, 'from = 2, unit = "?"', FACTOR.replace('"Volt"', "2")), (NO_UNIT, 'from = 1, unit = "?"', 'from = 1, unit = "ms"'))),
+     ((NO_UNIT, 'from = 2, unit = "?"', FACTOR.replace('"Volt"', "2")),
+      (NO_UNIT, 'from = 1, unit = "?"', 'from = 1, unit = "ms"'))),
     ("Audacity manual, Sample Data Export, linear, with header", "audacity.txt",
      "decay   1 channel (mono)\nSample Rate: 1000 Hz. Sample values on linear scale.\nLength processed: 1000 samples "
      "1.00000 seconds.\n\n" + rows("\n", numbers(X / 4, "{:.5f}")),

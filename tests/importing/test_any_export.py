@@ -142,7 +142,10 @@ def exports(draw: st.DrawFn) -> Case:
         lines = draw(st.sampled_from([[], ["Versuch 3"], ["Lab 2", "", "operator: K."], ["#remark 1"]]))
         notes = mark != " " and draw(st.booleans())
         if notes:  # a column of text that nobody wants
-            labels, written = [*labels, WORDS[language]["note"]], [*written, [f"gut {k % 3}" for k in range(len(columns[0]))]]
+            labels, written = (
+                [*labels, WORDS[language]["note"]],
+                [*written, [f"gut {k % 3}" for k in range(len(columns[0]))]],
+            )
         if mark == " ":
             labels = [label.replace(" ", "") for label in labels]
         head = [*lines, mark.join(labels)] + [mark.join([*units, *[""] * notes])] * (style == "row")

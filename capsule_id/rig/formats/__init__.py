@@ -23,7 +23,6 @@ from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout
 from capsule_id.rig.formats.text import read_csv
 
 
-
 def _unless_octave(read: Callable[[bytes, Path, Layout], Export], content: bytes, path: Path, layout: Layout) -> Export:
     """A file that Octave may have written, whatever its suffix, or one for ``read``."""
     return (read_octave if content.startswith(OCTAVE) else read)(content, path, layout)

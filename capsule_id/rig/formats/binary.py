@@ -272,7 +272,9 @@ read_hdf5 = read_mat = partial(_read_arrays, _in_process, "export it again", "")
 
 
 OCTAVE = b"# Created by Octave"
-_VARIABLE = re.compile(r"^# name: (\S+)\n# type: (matrix|scalar|(?:double_)?range)\n((?:(?!# name: ).*\n)*)", re.MULTILINE)
+_VARIABLE = re.compile(
+    r"^# name: (\S+)\n# type: (matrix|scalar|(?:double_)?range)\n((?:(?!# name: ).*\n)*)", re.MULTILINE
+)
 
 
 def _octave(content: bytes, path: Path) -> Named:

@@ -115,7 +115,10 @@ BLOCK = 1 << 20
 WINDOWS = "Windows-1252"
 _CODECS = {"UTF-16": "utf-16", WINDOWS: "cp1252"}
 #: A number with commas in quotation marks, and one whose comma can separate thousands.
-_QUOTED, _THOUSANDS = re.compile(rb'"([+-]?[0-9]+,[0-9,]*(?:\.[0-9]*)?)"'), re.compile(rb"[+-]?[1-9][0-9]{0,2}(?:,[0-9]{3})+")
+_QUOTED, _THOUSANDS = (
+    re.compile(rb'"([+-]?[0-9]+,[0-9,]*(?:\.[0-9]*)?)"'),
+    re.compile(rb"[+-]?[1-9][0-9]{0,2}(?:,[0-9]{3})+"),
+)
 _NOT_WINDOWS = re.compile(rb"[\x81\x8d\x8f\x90\x9d]")
 
 

@@ -26,7 +26,9 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
 #: A number whose thousands are separated; by decimal mark, one that shows by which mark they are.
-_GROUPED = re.compile("[+-]?[1-9][0-9]{0,2}(?P<mark>[.,'\u2019 \u00a0\u202f])[0-9]{3}(?:(?P=mark)[0-9]{3})*(?:[.,][0-9]*)?")
+_GROUPED = re.compile(
+    "[+-]?[1-9][0-9]{0,2}(?P<mark>[.,'\u2019 \u00a0\u202f])[0-9]{3}(?:(?P=mark)[0-9]{3})*(?:[.,][0-9]*)?"
+)
 _SHORT = re.compile("[+-]?[0-9]{1,3}")
 #: Cells such as 1,234 among which whole numbers show that their comma separates thousands.
 FEWEST_APART = 20
