@@ -343,6 +343,7 @@ class Layout:
     columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
     words : headers, or numbers counted from 1, of those whose texts it keeps too
     sheet : name of the sheet of a workbook (None: the first one with numbers)
+    split_by : header, or number, of the column each text of which is an experiment
     """
 
     data_from_line: int | None = None
@@ -352,6 +353,7 @@ class Layout:
     columns: tuple[str | int, ...] | None = None
     words: tuple[str | int, ...] = ()
     sheet: str | None = None
+    split_by: str | None = None
 
 
 @dataclass(frozen=True)
