@@ -227,6 +227,15 @@ LINE_MESSAGES = {
             "for hysteresis."
         ),
     ),
+    "lines.branches": Message(
+        "hysteresis",
+        ok="no difference between loading and unloading on {number:# calibration line}",
+        warn=(
+            "{y} is {difference:+.3g} {unit} while {x} falls, against the same {x} while it rises ({share:.1%} of the range, "
+            "{p:p}): hysteresis. The slope is {rising:.5g} on the way up and {falling:.5g} on the way down; {name} is that of "
+            "both. Use the part that the runs use, by data_from_line and data_to_line."
+        ),
+    ),
     "lines.two_rows": Message(
         "scatter of calibration lines",
         warn=(
@@ -286,6 +295,8 @@ def lint_line(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 SAME = 1e-9
 #: Smallest deviation of the levels from the line that counts, in sd of the repeated readings.
 SMALLEST_DEVIATION = 0.5
+#: Fewest rows of loading and of unloading that are compared.
+FEWEST_OF_A_BRANCH = 4
 
 
 def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
@@ -300,6 +311,26 @@ def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
         if p * len(lines) < LEVEL and size > SMALLEST_DEVIATION
     ]
     return findings or [Finding("lines.replicates", "ok", {"number": len(tests)})] * bool(tests)
+
+
+def check_branches(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Compare the branches of lines whose x rises and then falls, at equal x (t-test of their difference)."""
+    findings, number = list[Finding](), 0
+    for e in lines:
+        top = int(np.argmax(e.x))
+        rise, fall = np.arange(top + 1), np.arange(top + 1, e.n)
+        if min(len(rise), len(fall)) < FEWEST_OF_A_BRANCH or np.any((np.diff(e.x) > 0.0) != (np.arange(1, e.n) <= top)):
+            continue
+        number, (x, y) = number + 1, (e.x, e.observed)
+        differences = (y[fall] - np.interp(x[fall], x[rise], y[rise]))[x[fall] >= x[0]]
+        p, size = float(stats.ttest_1samp(differences, 0.0).pvalue), float(np.mean(differences))
+        if p < LEVEL:
+            rising, falling = (float(np.polyfit(x[rows], y[rows], 1)[0]) for rows in (rise, fall))
+            column, share = e.table.columns[e.reading], abs(size) / float(np.ptp(y))
+            facts = {"y": e.reading, "x": e.x_name, "unit": column.unit, "name": e.slope.name, "share": share, "p": p}
+            facts |= {"difference": size * column.to_display, "rising": rising, "falling": falling}
+            findings.append(Finding("lines.branches", "warn", facts, e.label, (e.slope.name,)))
+    return findings or [Finding("lines.branches", "ok", {"number": number})] * bool(number)
 
 
 def lack_of_fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
@@ -431,7 +462,7 @@ class Line(PointTest):
     unit_of_y: ClassVar[str] = "N"
     relative = False
     estimates_may_be_negative = True
-    checks = (check_linearity, check_replicates, check_scatter)
+    checks = (check_linearity, check_replicates, check_branches, check_scatter)
     tables = (line_table,)
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:

@@ -461,7 +461,7 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
     names, owners = np.unique(texts, return_inverse=True)
     if "" in names:
         row = int(np.argmin(owners))
-        raise InputError("split_by needs a text in every row", "none", "fill it", *raw.place(row, 0))
+        raise raw.error(row, raw.names[0], f"split_by needs a text in every row of {split}", "none", "fill it")
     return [*zip(map(str, names), raw.divided(owners), strict=True)]
 
 
