@@ -376,7 +376,9 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
     lines += ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found)
-    lines += [_commented(line, "unsure" if UNKNOWN in line else "likely", why) for line, why in lines_of_labels(found, kind)]
+    lines += [
+        _commented(line, "unsure" if UNKNOWN in line else "likely", why) for line, why in lines_of_labels(found, kind)
+    ]
     lines += _setting_lines(found, guessed, kind)
     lines += ["[experiment.columns]", *_column_lines(found, guessed, kind)]
     return "\n".join(lines) + "\n"

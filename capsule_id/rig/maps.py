@@ -201,7 +201,12 @@ def without_stated_errors(entry: Node, column: Column, kind: KindRule) -> Column
 
 def text_rule(what: str, example: str) -> PlainRule:
     """A text that is not empty."""
-    return PlainRule(lambda value: isinstance(value, str) and bool(value), f"be {what}", f'write ... = "{example}"', {"type": "string"})
+    return PlainRule(
+        lambda value: isinstance(value, str) and bool(value),
+        f"be {what}",
+        f'write ... = "{example}"',
+        {"type": "string"},
+    )
 
 
 LAYOUT: Mapping[str, SettingRule] = {
@@ -454,14 +459,17 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
     raw = RawTable(names, units, tuple(values[name] for name in names), rows, place)
     other = int(np.sum(~keep & ~missing))
     raw = raw if keep.all() else replace(raw.taken(np.flatnonzero(keep)), lost=rows[missing], other=other)
-    if (split := column_map.layout.split_by) is None:
-        return [("", raw)]
-    header, split_by = _header_named(split, parts), entry["split_by"]
+    return [("", raw)] if column_map.layout.split_by is None else _by_texts(entry["split_by"], parts, raw, keep)
+
+
+def _by_texts(split_by: Node, parts: Sequence["_Part"], raw: RawTable, keep: np.ndarray) -> list[tuple[str, RawTable]]:
+    """The rows that are kept for each text of the column that ``split_by`` names, after that text."""
+    header = _header_named(split_by.value, parts)
     texts = np.concatenate([part.find(split_by, header, texts=True)[0] for part in parts])[keep]
     names, owners = np.unique(texts, return_inverse=True)
     if "" in names:
-        row = int(np.argmin(owners))
-        raise raw.error(row, raw.names[0], f"split_by needs a text in every row of {split}", "none", "fill it")
+        rule = f"split_by needs a text in every row of {split_by.value}"
+        raise raw.error(int(np.argmin(owners)), raw.names[0], rule, "none", "fill it")
     return [*zip(map(str, names), raw.divided(owners), strict=True)]
 
 

@@ -3,7 +3,7 @@
 import hashlib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -389,27 +389,37 @@ def read_tables(
         rows = sum(len(raw.rows) for _, raw in parts)
         seen.append(Finding("times.stamps", "ok", {"file": nodes[0].value, "rows": rows}))
     tables = list[tuple[Table, RawTable]]()
-    ends = [re.sub("[^A-Za-z0-9._-]+", "_", normalize("NFKD", name).encode("ascii", "ignore").decode()) for name, _ in parts]
-    ends = ends if len({*ends}) == len(ends) else [str(k + 1) for k in range(len(ends))]
-    for end, (name, raw) in zip(ends, parts, strict=True):
-        own, here = (f"{label}_{end}", _directed(entry, settings, name)) if name else (label, settings)
+    for own, here, raw in _parted(entry, label, settings, parts):
         tables += _records(entry, kind, own, here, raw, plateaus, () if tables else tuple(seen))
     return [(replace(table, encodings=encodings), written) for table, written in tables], hashes
 
 
-def _directed(entry: Node, settings: Settings, name: str) -> Settings:
-    """The settings of the rows with the text ``name`` in the column ``split_by``: backward where it says so.
+def _parted(
+    entry: Node, label: str, settings: Settings, parts: Sequence[tuple[str, RawTable]]
+) -> Iterable[tuple[str, Settings, RawTable]]:
+    """Label, settings and rows of each part of an experiment, by its text in the column ``split_by``.
+
+    The direction is backward where the text says so.
 
     Raises
     ------
     InputError
         If the texts are those of surfaces, which one fit of friction cannot have.
     """
-    if "direction" in vars(settings) and fits_name(split := entry["split_by"].text(), "surface") > 0:
-        rule = "one fit has one surface: the rows of one alone may be used"
-        raise entry["split_by"].error(rule, split, f'write where = {{ "{split}" = "{name}" }} in place of split_by', True)
-    backward = "direction" in vars(settings) and fits_name(name, "backward") > 0
-    return replace(settings, **{"direction": "backward"}) if backward else settings
+    ends = [
+        re.sub("[^A-Za-z0-9._-]+", "_", normalize("NFKD", name).encode("ascii", "ignore").decode()) for name, _ in parts
+    ]
+    ends = ends if len({*ends}) == len(ends) else [str(k + 1) for k in range(len(ends))]
+    for end, (name, raw) in zip(ends, parts, strict=True):
+        directed = bool(name) and "direction" in vars(settings)
+        if directed and fits_name(split := entry["split_by"].text(), "surface") > 0:
+            rule = "one fit has one surface: the rows of one alone may be used"
+            raise entry["split_by"].error(
+                rule, split, f'write where = {{ "{split}" = "{name}" }} in place of split_by', True
+            )
+        backward = directed and fits_name(name, "backward") > 0
+        here = replace(settings, **{"direction": "backward"}) if backward else settings
+        yield f"{label}_{end}" if name else label, here, raw
 
 
 def _records(

@@ -88,73 +88,83 @@ def texts(values: np.ndarray, digits: int, decimal: str, group: str) -> list[str
     return [f"{value:,.{digits}f}".translate(marks) for value in values]
 
 
+@dataclass
+class Table:
+    """A table while it is drawn: columns as numbers and as texts, with names and units."""
+
+    names: list[str]
+    units: list[str]
+    columns: list[np.ndarray]
+    texts: list[list[str]]
+    true: dict[str, tuple[np.ndarray, float]]
+
+    def add(self, name: str, unit: str, values: np.ndarray, texts: list[str], true: np.ndarray, step: float) -> None:
+        self.names, self.units, self.columns = [*self.names, name], [*self.units, unit], [*self.columns, values]
+        self.texts, self.true[name] = [*self.texts, texts], (true, step)
+
+
+def add_times(draw: st.DrawFn, table: Table, writer: str, mark: str, decimal: str) -> None:
+    text, rate = writer not in BINARY, draw(st.sampled_from([250.0, 1000.0, 2000.0]))
+    time = np.arange(1000) / rate + draw(st.sampled_from([0.0, 12.5]))
+    form = draw(st.sampled_from([*CLOCKS, *(STAMPS if text and mark != " " else ())]))
+    form = "clock" if (mark, form) == (",", "clock, comma") else "s" if writer in ("lvm", "tdms") else form
+    if form in CLOCKS:
+        digits = {"s": 6, "min": 8}.get(form, 3)
+        values = np.round(time * CLOCKS[form], digits) if text else time * CLOCKS[form]
+        written = texts(values, digits, decimal, "")
+        table.add("time", form, values, written, values / CLOCKS[form], 10.0**-digits / CLOCKS[form])
+    else:
+        at = [STAMPS[form](START + timedelta(seconds=float(t))) for t in time]
+        table.add("time", "", time, at, time, 1e-6 if form == "ISO" else 1e-3)
+
+
+def add_readings(draw: st.DrawFn, table: Table, kind: str, plain: bool, decimal: str, group: str) -> None:
+    for name, (values, choices) in TABLES[kind].items():
+        unit = draw(st.sampled_from(list(choices)))
+        factor = choices[unit]
+        unit = {"µm": "um", "°": "deg"}.get(unit, unit) if plain else unit
+        least = 3 - int(np.floor(np.log10(factor))) + ("time" not in table.names)
+        digits = max(draw(st.integers(least, least + 2)), 0)
+        readings = np.round(values * factor, digits)
+        si = factor_to_si(unit, KINDS[kind].columns[name].si)
+        table.add(name, unit, readings, texts(readings, digits, decimal, group), readings * si, si * 10.0**-digits)
+
+
+def text_of(draw: st.DrawFn, table: Table, heads: list[str], note: str, mark: str) -> str:
+    style = "{} [{}]" if mark == " " else draw(st.sampled_from(["{} [{}]", "{} ({})", "{} / {}", "row"]))
+    labels = [head if style == "row" or not unit else style.format(head, unit)
+              for head, unit in zip(heads, table.units, strict=True)]  # fmt: skip
+    labels = [label.replace(" ", "") for label in labels] if mark == " " else labels
+    notes, cells = mark != " " and draw(st.booleans()), table.texts
+    if notes:  # a column of text that nobody wants
+        labels, cells = [*labels, note], [*cells, [f"gut {k % 3}" for k in range(len(table.columns[0]))]]
+    lines = draw(st.sampled_from([[], ["Versuch 3"], ["Lab 2", "", "operator: K."], ["#remark 1"]]))
+    head = [*lines, mark.join(labels)] + [mark.join([*table.units, *[""] * notes])] * (style == "row")
+    ending = draw(st.sampled_from(["\n", "\r\n"]))
+    return ending.join([*head, *(mark.join(row) for row in zip(*cells, strict=True)), ""])
+
+
 @st.composite
 def exports(draw: st.DrawFn) -> Case:
     kind = draw(st.sampled_from(list(TABLES)))
     record = kind in ("free_vibration", "forced_run")
     writer = draw(st.sampled_from(("csv", "csv", "txt", "dat", *BINARY)))
     writer = "txt" if writer in ("lvm", "tdms") and not record else writer
-    text = writer in ("csv", "txt", "dat")
     language, mark, decimal, group, encoding = draw(st.sampled_from(LOCALES))
-    if not text:
-        decimal, group = ".", ""
-    names, columns, units, true = [], [], [], dict[str, tuple[np.ndarray, float]]()
-    written = list[list[str]]()
+    binary = writer in BINARY
+    decimal, group = (".", "") if binary else (decimal, group)
+    plain, table = binary or encoding == "ascii", Table([], [], [], [], {})
     if record:
-        rate = draw(st.sampled_from([250.0, 1000.0, 2000.0]))
-        time = np.arange(1000) / rate + draw(st.sampled_from([0.0, 12.5]))
-        form = draw(st.sampled_from([*CLOCKS, *(STAMPS if text and mark != " " else ())]))
-        form = "clock" if (mark, form) == (",", "clock, comma") else "s" if writer in ("lvm", "tdms") else form
-        if form in CLOCKS:
-            digits = 6 if form in ("s", "min") else 3
-            digits = 8 if form == "min" else digits
-            values = np.round(time * CLOCKS[form], digits) if text else time * CLOCKS[form]
-            columns, units, written = [values], [form], [texts(values, digits, decimal, "")]
-            true["time"] = values / CLOCKS[form], 10.0**-digits / CLOCKS[form]
-        else:
-            at = [START + timedelta(seconds=float(t)) for t in time]
-            columns, units, written = [time], [""], [[STAMPS[form](one) for one in at]]
-            true["time"] = time, 1e-6 if form == "ISO" else 1e-3
-        names = ["time"]
-    for name, (values, choices) in TABLES[kind].items():
-        unit = draw(st.sampled_from(list(choices)))
-        unit = "um" if unit == "µm" and (encoding == "ascii" or not text) else unit
-        unit = "deg" if unit == "°" and (encoding == "ascii" or not text) else unit
-        factor = choices["µm" if unit == "um" else unit]
-        least = 3 - int(np.floor(np.log10(factor))) + (not record)
-        digits = max(draw(st.integers(least, least + 2)), 0)
-        readings = np.round(values * factor, digits)
-        si = factor_to_si(unit, KINDS[kind].columns[name].si)
-        true[name] = readings * si, si * 10.0**-digits
-        names, columns, units = [*names, name], [*columns, readings], [*units, unit]
-        written.append(texts(readings, digits, decimal, group))
-    heads = [WORDS[language][name] for name in names]
-    if encoding == "ascii" or not text:
-        heads = [normalize("NFKD", head).encode("ascii", "ignore").decode() for head in heads]
-    style = draw(st.sampled_from(["[]", "()", "row", "/"]))
-    if not text or mark == " ":
-        style = "[]"
-    labels = [f"{h} [{u}]" if style == "[]" else f"{h} ({u})" if style == "()" else f"{h} / {u}" for h, u in
-              zip(heads, units, strict=True)]  # fmt: skip
-    labels = [head if not unit or style == "row" else label
-              for head, unit, label in zip(heads, units, labels, strict=True)]  # fmt: skip
-    if text:
-        lines = draw(st.sampled_from([[], ["Versuch 3"], ["Lab 2", "", "operator: K."], ["#remark 1"]]))
-        notes = mark != " " and draw(st.booleans())
-        if notes:  # a column of text that nobody wants
-            labels, written = (
-                [*labels, WORDS[language]["note"]],
-                [*written, [f"gut {k % 3}" for k in range(len(columns[0]))]],
-            )
-        if mark == " ":
-            labels = [label.replace(" ", "") for label in labels]
-        head = [*lines, mark.join(labels)] + [mark.join([*units, *[""] * notes])] * (style == "row")
-        body = [mark.join(row) for row in zip(*written, strict=True)]
-        ending = draw(st.sampled_from(["\n", "\r\n"]))
-        return Case(f"Messung 3.{writer}", (ending.join([*head, *body]) + ending).encode(encoding), kind, true)
-    table = dict(zip(labels, columns, strict=True))
-    file = f"a.{'mat' if writer == 'mat73' else writer}"
-    return Case(file, WRITERS[writer](table), kind, true)
+        add_times(draw, table, writer, mark, decimal)
+    add_readings(draw, table, kind, plain, decimal, group)
+    heads = [WORDS[language][name] for name in table.names]
+    heads = [normalize("NFKD", head).encode("ascii", "ignore").decode() for head in heads] if plain else heads
+    if not binary:
+        content = text_of(draw, table, heads, WORDS[language]["note"], mark).encode(encoding)
+        return Case(f"Messung 3.{writer}", content, kind, table.true)
+    labels = [f"{head} [{unit}]" for head, unit in zip(heads, table.units, strict=True)]
+    content = WRITERS[writer](dict(zip(labels, table.columns, strict=True)))
+    return Case(f"a.{'mat' if writer == 'mat73' else writer}", content, kind, table.true)
 
 
 def _xlsx(columns: Mapping[str, np.ndarray]) -> bytes:

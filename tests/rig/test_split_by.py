@@ -49,7 +49,9 @@ def refusal(rig: Path, capsys: pytest.CaptureFixture[str]) -> str:
 CHOSEN = ('{ "Untergrund" = "?" }', '{ "Untergrund" = "Stahl" }')
 
 
-def test_the_surface_is_asked_and_each_direction_is_an_experiment(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_surface_is_asked_and_each_direction_is_an_experiment(
+    rig: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Before: the eight rows were pulls on one surface in one direction."""
     assert "column 'Untergrund' holds 'PTFE' 'Stahl', '?', write one of the values" in refusal(rig, capsys)
     tables = read_rig(edited(rig, CHOSEN)).tables
@@ -73,14 +75,19 @@ def test_surfaces_are_not_divided_into_one_fit(rig: Path, capsys: pytest.Capture
     edits = (("where = ", "# where = "), ('split_by = "Richtung"', 'split_by = "Untergrund"'))
     said = refusal(edited(rig, *edits), capsys)
     assert "one fit has one surface" in said
-    assert (remedy := 'where = { "Untergrund" = "PTFE" }') in said
+    remedy = 'where = { "Untergrund" = "PTFE" }'
+    assert remedy in said
     (table,) = read_rig(edited(rig, ('split_by = "Untergrund"', remedy))).tables
     assert sorted(table["force"]) == [0.98, 1.02]
 
 
 @pytest.mark.parametrize(
     ("column", "said"),
-    [("Kraft", "Kraft"), ("", "split_by must be the header of a column"), ("Bemerkung", "split_by needs a text in every row of Bemerkung")],
+    [
+        ("Kraft", "Kraft"),
+        ("", "split_by must be the header of a column"),
+        ("Bemerkung", "split_by needs a text in every row of Bemerkung"),
+    ],
 )
 def test_what_cannot_divide_is_refused(column: str, said: str, rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert said in refusal(edited(rig, CHOSEN, ('split_by = "Richtung"', f'split_by = "{column}"')), capsys)
@@ -93,7 +100,8 @@ def test_an_error_about_an_unknown_column_names_the_surface(tmp_path: Path, caps
     entry = head + '[[experiment]]\nkind = "static_friction"\nfile = "a.csv"\n'
     (tmp_path / "rig.toml").write_text(entry, encoding="utf-8")
     said = refusal(tmp_path, capsys)
-    assert (remedy := 'and where = { "surface" = "?" }') in said
+    remedy = 'and where = { "surface" = "?" }'
+    assert remedy in said
     columns = 'columns = { force = { from = "force [N]", unit = "N" } }'
     assert columns in said
     (tmp_path / "rig.toml").write_text(f"{entry}{columns}\n{remedy[4:]}\ndata_from_line = 2\n", encoding="utf-8")
