@@ -228,7 +228,7 @@ def holds(case: Case) -> None:
         np.testing.assert_allclose(found + shift, true, rtol=1e-12, atol=1.001 * step + 1e-9 * (column == "time"))
 
 
-@pytest.mark.parametrize("examples", [12, pytest.param(400, marks=pytest.mark.full)])
+@pytest.mark.parametrize("examples", [12, pytest.param(200, marks=pytest.mark.full)])
 def test_what_is_written_is_read(examples: int) -> None:
     """Each example is one file."""
 
