@@ -107,7 +107,8 @@ def add_times(draw: st.DrawFn, table: Table, writer: str, mark: str, decimal: st
     text, rate = writer not in BINARY, draw(st.sampled_from([250.0, 1000.0, 2000.0]))
     time = np.arange(1000) / rate + draw(st.sampled_from([0.0, 12.5]))
     form = draw(st.sampled_from([*CLOCKS, *(STAMPS if text and mark != " " else ())]))
-    form = "clock" if (mark, form) == (",", "clock, comma") else "s" if writer in ("lvm", "tdms") else form
+    form = "clock" if mark == "," and form in ("clock, comma", "German") else form  # a comma would part the stamp
+    form = "s" if writer in ("lvm", "tdms") else form
     if form in CLOCKS:
         digits = {"s": 6, "min": 8}.get(form, 3)
         values = np.round(time * CLOCKS[form], digits) if text else time * CLOCKS[form]
