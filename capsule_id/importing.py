@@ -29,15 +29,17 @@ from capsule_id.rig.guess import (
     fits_name,
     increases,
     is_constant,
+    lines_of_labels,
     readings_of,
     score_of,
     source_of,
     times_of,
+    times_of_trace,
     unit_of,
 )
 from capsule_id.rig.schema import SHORTEST_RECORD, QuantityRule
 from capsule_id.rig.times import evened
-from capsule_id.rig.units import UNKNOWN, factor_to_si
+from capsule_id.rig.units import SIGNALS, UNKNOWN, factor_to_si, symbol_named
 from capsule_id.views import counted
 
 # guess: Guesses the kind of experiment of an export, and which of its columns and units are those of the kind.
@@ -374,6 +376,9 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
     lines += ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found)
+    lines += [
+        _commented(line, "unsure" if UNKNOWN in line else "likely", why) for line, why in lines_of_labels(found, kind)
+    ]
     lines += _setting_lines(found, guessed, kind)
     lines += ["[experiment.columns]", *_column_lines(found, guessed, kind)]
     return "\n".join(lines) + "\n"
@@ -509,10 +514,15 @@ def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
         if guessed.rate is not None:
             rate, confidence, reason = f"{guessed.rate:g}", "likely", "the file states this rate and no times"
         yield _commented(f'{TIME} = {{ rate = {{ value = {rate}, unit = "Hz" }} }}', confidence, reason)
+    for index in times_of_trace(found, kind)[:1]:  # check refuses it: no sample of a trace may pass for a trial
+        source = f'{{ from = {source_of(found, index)}, unit = "{unit_of(found.header(index, ["s"])[1], ["s"]) or UNKNOWN}" }}'
+        yield _commented(f"{TIME} = {source}", "unsure", f"a record in time: read the trials of {kind.name} off it")
     for name, column in guessed.columns.items():
         for each in (column, *column.rivals):
             factor = "" if each.scale is None else f", scale = {each.scale:.10g}"
-            source = f'{{ from = {source_of(found, each.index)}, unit = "{each.unit}"{factor} }}'
+            signal = symbol_named(found.header(each.index, ["s"])[1])  # check then asks for the sensitivity
+            unit = signal if each.unit == UNKNOWN and signal in SIGNALS else each.unit
+            source = f'{{ from = {source_of(found, each.index)}, unit = "{unit}"{factor} }}'
             reason = column.reason if each is column else "or this one"
             yield _commented(f"{'# ' * column.asked}{name} = {source}", column.confidence, reason)
 

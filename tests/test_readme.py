@@ -4,6 +4,7 @@ import re
 import shlex
 import tomllib
 from dataclasses import fields
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -69,50 +70,63 @@ def test_the_two_commands_set_up_and_run() -> None:
     assert "test" in PROJECT["optional-dependencies"]
 
 
+#: A first user's export: titles, semicolons, decimal commas, micrometres, notes, stamps, a release after 0.35 s.
+GERMAN = "Messung 3.csv"
+
+
+def own_record(file: str, header: str, readings: list[str], k1: float, c: float, m1: float) -> str:
+    """A decay as README's, or as ``GERMAN``."""
+    begin, second = (float(line.split(",")[0]) for line in readings)
+    time = begin + (second - begin) * np.arange(1500) * (2 if file == GERMAN else 1)
+    gamma, release = c / (2.0 * m1), 0.35 * (file == GERMAN)
+    omega, since = np.sqrt(k1 / m1 - gamma**2), np.maximum(time - release, 0.0)
+    swing = np.cos(omega * since) + gamma / omega * np.sin(omega * since)
+    noise = 0.02 * np.random.default_rng(0).standard_normal(time.size)
+    x_rel = float(readings[0].split(",")[1]) * np.exp(-gamma * since) * swing + noise
+    if file != GERMAN:
+        return f"{header}\n" + "".join(f"{t:.4f},{x:.4f}\n" for t, x in zip(time, x_rel, strict=True))
+    stamps = [datetime(2024, 3, 1, 12, 34, 56, 789000) + timedelta(seconds=float(t)) for t in time]
+    cells = zip(
+        (f"{at:%H:%M:%S,%f}"[:-3] for at in stamps), (f"{1e3 * x:.1f}".replace(".", ",") for x in x_rel), strict=True
+    )
+    rows = [f"{stamp};{x};{'Stoß' * (k == 700)}" for k, (stamp, x) in enumerate(cells)]
+    titles = [
+        "Ausschwingversuch 3",
+        "Prüfer: K. Weiß; Ort: Labor 2",
+        "Abtastrate 1000 Hz",
+        "",
+        "Uhrzeit;Weg (µm);Bemerkung",
+    ]
+    return "\r\n".join([*titles, *rows, ""])
+
+
+@pytest.mark.parametrize("file", ["decay.csv", GERMAN])
 def test_a_record_of_ones_own_gives_k1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The steps of README, from a file with headers of a laboratory program to k1.
+    """The three commands of README, from a file of a laboratory program to k1, without an edit.
 
     In this process: a child process would import JAX for each step. That the installed command runs in a process of its
     own stands in ``test_main_job.py``.
     """
     monkeypatch.chdir(tmp_path)
-
-    def run(command: str, *words: str) -> tuple[int, str, str]:
-        code = {"capsule-id": cli.capsule_id, "fit-params": cli.fit_params}[command](words)
-        return code, *capsys.readouterr()
-
-    rig, m1, k1, c = tmp_path / "my-rig", 0.11, 1420.0, 1.9
-    rig.mkdir()
-    description, columns = blocks("toml")
-    (rig / "rig.toml").write_text(description, encoding="utf-8")
+    k1, c, m1 = 1420.0, 1.9, 0.11
     header, *readings = blocks("csv")[0].splitlines()
-    (own,) = re.findall(r"its own headers, such as `(.*?)`", README)
-
-    begin, second = (float(line.split(",")[0]) for line in readings)
-    time = begin + (second - begin) * np.arange(1000)
-    gamma = c / (2.0 * m1)
-    omega = np.sqrt(k1 / m1 - gamma**2)
-    swing = np.cos(omega * time) + gamma / omega * np.sin(omega * time)
-    noise = 0.02 * np.random.default_rng(0).standard_normal(time.size)
-    x_rel = float(readings[0].split(",")[1]) * np.exp(-gamma * time) * swing + noise
-    body = "".join(f"{t:.4f},{x:.4f}\n" for t, x in zip(time, x_rel, strict=True))
-    table = rig / tomllib.loads(description)["experiment"][0]["file"]
-
-    check, fit = (line.removeprefix(".venv/bin/").split() for line in blocks("sh")[2].splitlines())
-    table.write_text(f"{header}\n{body}", encoding="utf-8")
-    code, out, _ = run(*check)
-    assert (code, out.splitlines()[-1]) == (0, "no findings")
-
-    table.write_text(f"{own}\n{body}", encoding="utf-8")
-    code, _, error = run(*check)
-    assert code == cli.BAD_INPUT
-    assert columns.strip() in error
-    (rig / "rig.toml").write_text(description + columns, encoding="utf-8")
-    code, out, _ = run(*check)
-    assert (code, out.splitlines()[-1]) == (0, "no findings")
-    code, out, error = run(*fit, "--no-sample", "--quiet")
+    encoding = "cp1252" if file == GERMAN else "utf-8"
+    Path(file).write_text(own_record(file, header, readings, k1, c, m1), encoding=encoding, newline="")
+    steps = [line.removeprefix(".venv/bin/").split() for line in blocks("sh")[2].splitlines()]
+    assert [words[-1] for words in steps] == ["decay.csv", "my-rig", "my-rig"]
+    (program, *init), (_, *check), (_, *fit) = steps
+    assert program == "capsule-id"
+    assert cli.capsule_id([*init[:-1], file]) == 0
+    if file != GERMAN:
+        written = (tmp_path / "my-rig" / "rig.toml").read_text(encoding="utf-8").splitlines()
+        shown = [re.sub(r"\d+(%| rows)", "", line) for line in blocks("toml")[0].splitlines()]
+        assert [line for line in shown if line not in {re.sub(r"\d+(%| rows)", "", each) for each in written}] == []
+    capsys.readouterr()
+    assert cli.capsule_id(check) == 0
+    assert not re.search("^(fail|warn)", capsys.readouterr().out, re.MULTILINE)
+    code, (out, error) = cli.fit_params([*fit, "--no-sample", "--quiet"]), capsys.readouterr()
     assert (code, error) == (0, "")
     value, sd = (float(x) for x in re.findall(r"^k1 +N/m +(\S+) ± (\S+)", out, re.MULTILINE)[0])
     assert abs(value - k1) < 3.0 * sd < 0.02 * k1

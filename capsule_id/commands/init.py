@@ -27,7 +27,7 @@ from capsule_id.rig.schema import (
     number_schema,
     table_schema,
 )
-from capsule_id.rig.toml import ANY, NAME_PATTERN, PRIOR_KEYS
+from capsule_id.rig.toml import ANY, NAME_PATTERN, PRIOR_KEYS, Node, parse_toml
 
 #: The head of ``rig.toml``. Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
 HEAD = Path(__file__).with_name("template.toml")
@@ -129,6 +129,7 @@ def _prior_schema(unit: str, prior: Prior | None) -> dict[str, Any]:
     return table_schema({**keys, "unit": {**_TEXT, "description": unit}}, (*keys, *["unit"] * (unit != "1")))
 
 
+_MASSES = {"m1": "rod", "m2": "capsule"}
 OPTIONS = {
     "": (
         ("dir", "DIR", "new or empty folder; with --from it may hold the files"),
@@ -138,8 +139,27 @@ OPTIONS = {
             "exports of loggers and programs: copy them into DIR and guess the entries that read them",
             {"dest": "files", "nargs": "+", "type": Path, "default": []},
         ),
+        *(
+            (f"--{m}", ("VALUE", "SD", "UNIT"), f"mass of the {part}: 110 0.5 g", {"nargs": 3})
+            for m, part in _MASSES.items()
+        ),
     )
 }
+
+
+def _mass_line(name: str, value: str, sd: str, unit: str) -> str:
+    """The line of [rig] that states a mass.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    line = f"{name} = {{ value = {value}, sd = {sd}, unit = {json.dumps(unit)} }}"
+    document = parse_toml(line, Path(f"--{name}"))
+    rule = RIG_QUANTITIES[name]
+    Node(document, (name,), document.data[name]).quantity(rule.si, rule.domain, rule.has_sd)
+    return line
 
 
 def run(args: argparse.Namespace) -> int:
@@ -151,6 +171,7 @@ def run(args: argparse.Namespace) -> int:
         If DIR holds other files, is no folder, or cannot be written; if an export cannot be read.
     """
     folder, files = Path(args.dir), list(args.files)
+    masses = {m: _mass_line(m, *getattr(args, m)) for m in _MASSES if getattr(args, m)}
     kinds = default_registry()
     contents = {path.name: read_file(path) for path in files}
     if len(contents) < len(files):
@@ -164,6 +185,8 @@ def run(args: argparse.Namespace) -> int:
         name = folder.resolve().name
         usable = re.fullmatch(NAME_PATTERN, name) and name.strip(".")
         text = template(kinds, name if usable else "rig", [entry for entry, _ in guesses.values()])
+        for m, line in masses.items():
+            text = re.sub(rf"^# {m} = .*", line, text, count=1, flags=re.MULTILINE)
         schema = json.dumps(rig_schema(kinds), separators=(",", ":")) + "\n"
         contents = {"rig.toml": text.encode(), "rig.schema.json": schema, **contents}
         # A part of a table would be read as a table.
@@ -178,5 +201,9 @@ def run(args: argparse.Namespace) -> int:
         f"{file}: {'kind unsure' if guessed is None else guessed.kind}{', unsure' if guessed and guessed.unsure else ''}"
         for file, (_, guessed) in guesses.items()
     ]
-    say("\n".join([*lines, f"check its guesses, state the masses, then run capsule-id check {folder}"]))
+    say(
+        "\n".join(
+            [*lines, f"check its guesses, {'' if masses else 'state the masses, '}then run capsule-id check {folder}"]
+        )
+    )
     return 0

@@ -235,6 +235,15 @@ LINE_MESSAGES = {
             "for hysteresis."
         ),
     ),
+    "lines.branches": Message(
+        "hysteresis",
+        ok="no difference between loading and unloading on {number:# calibration line}",
+        warn=(
+            "{y} is {difference:+.3g} {unit} while {x} falls, against the same {x} while it rises ({share:.1%} of the range, "
+            "{p:p}): hysteresis. The slope is {rising:.5g} on the way up and {falling:.5g} on the way down; {name} is that of "
+            "both. Use the part that the runs use, by data_from_line and data_to_line."
+        ),
+    ),
     "lines.two_rows": Message(
         "scatter of calibration lines",
         warn=(
@@ -292,6 +301,8 @@ def lint_line(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 
 #: Smallest deviation of the levels from the line that counts, in sd of the repeated readings.
 SMALLEST_DEVIATION = 0.5
+#: Fewest rows of loading and of unloading that are compared.
+FEWEST_OF_A_BRANCH = 4
 
 
 def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
@@ -306,6 +317,27 @@ def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
         if p * len(lines) < LEVEL and size > SMALLEST_DEVIATION
     ]
     return findings or [Finding("lines.replicates", "ok", {"number": len(tests)})] * bool(tests)
+
+
+def check_branches(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Compare the branches of lines whose x rises and then falls, at equal x (t-test of their difference)."""
+    findings, number = list[Finding](), 0
+    for e in lines:
+        top = int(np.argmax(e.x))
+        rise, fall = np.arange(top + 1), top + 1 + np.flatnonzero(e.x[top + 1 :] >= e.x[0])
+        if min(len(rise), len(fall)) < FEWEST_OF_A_BRANCH or np.any((np.diff(e.x) > 0.0) != (np.arange(1, e.n) <= top)):
+            continue
+        number, (x, y) = number + 1, (e.x, e.observed)
+        differences = y[fall] - np.interp(x[fall], x[rise], y[rise])
+        size, error = float(np.mean(differences)), float(np.std(differences, ddof=1)) / np.sqrt(len(fall))
+        p = float(2.0 * stats.t.sf(abs(size) / max(error, np.finfo(float).tiny), len(fall) - 1))
+        if p < LEVEL:
+            rising, falling = (float(np.polyfit(x[rows], y[rows], 1)[0]) for rows in (rise, fall))
+            column, share = e.table.columns[e.reading], abs(size) / float(np.ptp(y))
+            facts = {"y": e.reading, "x": e.x_name, "unit": column.unit, "name": e.slope.name, "share": share, "p": p}
+            facts |= {"difference": size * column.to_display, "rising": rising, "falling": falling}
+            findings.append(Finding("lines.branches", "warn", facts, e.label, (e.slope.name,)))
+    return findings or [Finding("lines.branches", "ok", {"number": number})] * bool(number)
 
 
 def lack_of_fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
@@ -461,7 +493,7 @@ class Line(PointTest):
     from_origin: ClassVar[bool] = False
     relative = False
     estimates_may_be_negative = True
-    checks = (check_linearity, check_replicates, check_scatter)
+    checks = (check_linearity, check_replicates, check_branches, check_scatter)
     tables = (line_table,)
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:

@@ -425,6 +425,7 @@ QUESTIONS: Mapping[str, str] = {
         "Do the means of repeated readings lie on the line? "
         "{deviation:.1f} sd of a reading off ({p:p}), limit p = 0.002."
     ),
+    "lines.branches": "Are loading and unloading the same? {share:.1%} of the range apart ({p:p}), limit p = 0.002.",
     "friction.order": "Do the residuals of the friction tests show an order in speed? {p:p}, limit 0.002.",
     "friction.one_surface": "Do tilts and slides show one surface? {p:p}, limit 0.002.",
     "friction.variants": "Is another friction law more probable? The best one is {factor:.3g} times as probable, limit 100.",

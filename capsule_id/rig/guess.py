@@ -5,7 +5,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, groupby, pairwise, product, takewhile
 from pathlib import Path
 from typing import Literal
@@ -27,7 +27,7 @@ from capsule_id.rig.formats.raw import (
     TextFile,
     lines_of,
 )
-from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps
+from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps, shown_cell
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.times import evened
 from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si, scale, symbol_named
@@ -71,6 +71,10 @@ WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, wor
     "periods": "periods n cycles perioden periodes periodos periodi zyklen ciclos cicli pulses impulse "
     "impulses pulsos impulsi",
     "session": "session day",
+    "direction": "direction dir richtung sens sentido verso direzione direccion",
+    "backward": "backward backwards back reverse ruckwarts zuruck ruck arriere retour atras vuelta indietro ritorno",
+    "surface": "surface surfaces track material oberflache untergrund bahn belag revetement superficie piste pista "
+    "superficies materiale matiere materiau werkstoff",
     "uncertainty": "sd std stdev sigma err error unc uncertainty fehler abweichung unsicherheit ecart "
     "incertitude desviacion incertidumbre errore deviazione incertezza",
     "break-away": "fs fmax fstat max peak static statique statisch estatic maxim massim break_away breakaway "
@@ -81,6 +85,8 @@ WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, wor
     "reading": "reading counts adc raw cell messwert ablesung lecture lectura lettura signal output anzeige "
     "digits",
 }.items()}  # fmt: skip
+#: Columns of texts that tell the rows of a friction table apart.
+LABELS = ("surface", "direction")
 #: Names of the same quantity.
 SAME = {"acceleration_rod": "acceleration", "slope": "angle", "speed": "velocity"}
 #: Fewest letters of a word that can end a compound, and shorter words that can.
@@ -204,6 +210,7 @@ class FoundLayout:
     stamps : indices of the columns of time stamps, in seconds since the first one
     blocks : first and last line of each block of readings, counted from 1, of a text with other lines between or below
         them, of which ``export`` holds the longest; else ()
+    labels : index of a column of ``unread`` that tells directions or surfaces apart -> its texts
     """
 
     export: Export
@@ -215,6 +222,7 @@ class FoundLayout:
     rate: float | None
     stamps: frozenset[int] = frozenset()
     blocks: tuple[tuple[int, int], ...] = ()
+    labels: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
 
     def header(self, index: int, dimensions: Sequence[str]) -> tuple[str, str]:
         """Name of a column, and the text of its unit: that of its header, else that of the row of units, or ""."""
@@ -273,20 +281,27 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
     stamps = {index: values for index in unread if (values := _stamps(content, export, layout, index)) is not None}
     read_too = {index: error for index, error in unread.items() if index not in stamps}
-    rate = _rate(beginning, names, singles)
-    return FoundLayout(export, layout, names, units, {**columns, **stamps}, read_too, rate, frozenset(stamps), blocks)
+    rate, labels = _rate(beginning, names, singles), dict[int, tuple[str, ...]]()
+    for index in (i for i in unread if any(fits_name(names[i], word) > 0 for word in LABELS)):
+        labels[index] = tuple(sorted({*_texts(content, export, layout, index)}))
+    every = {**columns, **stamps}
+    return FoundLayout(export, layout, names, units, every, read_too, rate, frozenset(stamps), blocks, labels)
 
 
 def _stamps(content: bytes, export: Export, layout: Layout, index: int) -> np.ndarray | None:
     """A column of time stamps that increase, (n,) s since the first one; None for another column."""
-    layout = replace(layout, columns=(index + 1,), words=(index + 1,))
     with suppress(InputError):
-        again = EXPORTS[suffix_of(export.path)](content, export.path, layout)
-        if again.words is not None:
-            texts = again.words(index).tolist()
-            values = seconds_of_stamps(texts, layout.missing, lambda row: again.place(row, index))
-            return values if np.nanmax(values) > 0.0 and increases(values) else None
+        texts = _texts(content, export, layout, index)
+        values = seconds_of_stamps(texts, layout.missing, lambda row: export.place(row, index))
+        return values if np.nanmax(values) > 0.0 and increases(values) else None
     return None
+
+
+def _texts(content: bytes, export: Export, layout: Layout, index: int) -> list[str]:
+    """The texts of a column; [] where the format has none."""
+    layout = replace(layout, columns=(index + 1,), words=(index + 1,))
+    again = EXPORTS[suffix_of(export.path)](content, export.path, layout)
+    return [] if again.words is None else again.words(index).tolist()
 
 
 def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
@@ -407,8 +422,11 @@ def _headers(export: Export, dimensions: Sequence[str]) -> tuple[tuple[str, ...]
     rows = list(export.headers[:3])
     units = next((row for row in rows if is_units_row(row, dimensions)), None)
     names = next((row for row in rows if row is not units), None)
+    if units is not None and rows[-1] is not units:  # comments may stand below the units, names stand above them
+        names = rows[rows.index(units) + 1]
     if names is None and units is not None:  # the only row of headers is a row of units, or of short names
-        return units, empty
+        known = {word for words in WORDS.values() for word in words}
+        return units, tuple("" if _bare(cell) in known else cell.strip(" []()") for cell in units)
     return names or empty, tuple(cell.strip(" []()") for cell in units) if units is not None else empty
 
 
@@ -541,6 +559,16 @@ def times_of(found: FoundLayout) -> list[int]:
     return [index for index in named if increases(found.columns[index])]
 
 
+def times_of_trace(found: FoundLayout, kind: KindRule) -> list[int]:
+    """Columns of times of a file that is a record in time, where a row of ``kind`` is a trial, which is read off a record.
+
+    A reading of a calibration is a row of a record.
+    """
+    rules = kind.columns.values()
+    long = [index for index in times_of(found) if len(found.columns[index]) >= FEWEST_SAMPLES]
+    return [] if TIME in kind.columns or any(rule.varies for rule in rules) else long
+
+
 def is_constant(found: FoundLayout, index: int) -> bool:
     """Whether a column of several rows is the same in all of them."""
     return len(values := found.columns[index]) > 1 and bool(np.nanmax(values) == np.nanmin(values))
@@ -592,6 +620,17 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     return by_name + UNIT_SCORE, ColumnGuess(index, unit, "likely" if unit == "g_n" else "sure", reason)
 
 
+def lines_of_labels(found: FoundLayout, kind: KindRule) -> Iterable[tuple[str, str]]:
+    """Settings that part the rows of a friction table by the texts of a column, and why."""
+    for index, texts in found.labels.items() if "direction" in kind.setting_rules else ():
+        source, held = source_of(found, index), " ".join(map(shown_cell, texts))
+        if len(texts) > 1 and fits_name(found.names[index], "surface") > 0:
+            key = source if source.startswith('"') else f'"{source}"'
+            yield f'where = {{ {key} = "{UNKNOWN}" }}', f"one capsule has one surface in a fit: write one of {held}"
+        elif len(texts) > 1:
+            yield f"split_by = {source}", f"an experiment for each of {held}; remove this line to use all rows as one"
+
+
 def source_of(found: FoundLayout, index: int) -> str:
     """The header of a column, or its number where the header is not unique, long or absent."""
     header = found.names[index]
@@ -608,10 +647,7 @@ def proposal(kind: KindRule, found: FoundLayout | None) -> str:
     best, record = Assignment(kind, {}, 0.0, kind.sets[0], kind.channels[:1]), False
     if found is not None:
         best = max(assignments(found, kind), key=lambda one: (-len(one.missing), one.score))
-        # A reading of a calibration is a row of a record; a trial is not.
-        record = not any(rule.varies for rule in kind.columns.values()) and any(
-            len(found.columns[index]) >= FEWEST_SAMPLES for index in times_of(found)
-        )
+        record = bool(times_of_trace(found, kind))
     texts, words = [], []
     for name in dict.fromkeys((*best.wanted, *best.columns, *best.missing)):
         column = best.columns.get(name)
@@ -625,4 +661,5 @@ def proposal(kind: KindRule, found: FoundLayout | None) -> str:
                 source = source.replace(f'"{UNKNOWN}"', source_of(found, column.index), 1)
         if column is None or not column.asked or name not in kind.optional:
             texts.append(f"{name} = {{ {source} }}")
-    return f"columns = {{ {', '.join(texts)} }}" + (f" ({'; '.join(words)})" if words else "")
+    more = "".join(f" and {line}" for line, _ in (lines_of_labels(found, kind) if found is not None else ()))
+    return f"columns = {{ {', '.join(texts)} }}{more}" + (f" ({'; '.join(words)})" if words else "")

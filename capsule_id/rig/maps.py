@@ -200,6 +200,16 @@ def without_stated_errors(entry: Node, column: Column, kind: KindRule) -> Column
 # declared: Reads the column map of an experiment in ``rig.toml``: ``columns`` and the keys that go with it.
 
 
+def text_rule(what: str, example: str) -> PlainRule:
+    """A text that is not empty."""
+    return PlainRule(
+        lambda value: isinstance(value, str) and bool(value),
+        f"be {what}",
+        f'write ... = "{example}"',
+        {"type": "string"},
+    )
+
+
 LAYOUT: Mapping[str, SettingRule] = {
     "data_from_line": PlainRule(
         is_count, "be a line, counted from 1", "write the line of the first reading, such as 2", WHOLE
@@ -214,12 +224,8 @@ LAYOUT: Mapping[str, SettingRule] = {
         {"type": "array", "items": {"type": "string"}},
     ),
     "decimal": ChoiceRule((".", ",")),
-    "sheet": PlainRule(
-        lambda value: isinstance(value, str) and bool(value),
-        "be the name of a sheet",
-        'write sheet = "Sheet1"',
-        {"type": "string"},
-    ),
+    "sheet": text_rule("the name of a sheet", "Sheet1"),
+    "split_by": text_rule("the header of a column, or its number in quotes", "direction"),
 }
 #: Keys of an experiment that go with ``columns``.
 MAP_KEYS = ("columns", "files", *LAYOUT, "where", "plateaus")
@@ -311,8 +317,8 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
         example = propose(layout)
         node.table(example)
         raise node.error("a column map must have columns", "none", f"write {example}")
-    # Plateaus are readings of a time trace, whatever the columns of the kind.
-    rules = {**({"time": ColumnRule("s")} if "plateaus" in entry else {}), **kind.columns}
+    # Plateaus are readings of a time trace, whatever the columns of the kind; without them a trace is refused as such.
+    rules = {"time": ColumnRule("s"), **kind.columns}
     node.refuse_unknown(tuple(rules))
     sources = {name: _source(node[name], rules[name]) for name in node.value}
     where = entry.get("where", {}).table("where = { <header> = <value> }")
@@ -321,7 +327,7 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
     # A key of ``where`` is a header, or the number of a column.
     keys = [
         (form, value)
-        for key, value in wanted.items()
+        for key, value in (*wanted.items(), *([(layout.split_by, "")] if layout.split_by else []))
         for form in (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))
     ]
     words = tuple(form for form, value in keys if isinstance(value, str))
@@ -401,8 +407,10 @@ _MOST_VALUES = 6  # shown of a column where no row has the value wanted
 Found = tuple[np.ndarray, Callable[[int | None], Place]]  #: one column of a part: its numbers, and where a row stands
 
 
-def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> RawTable:
-    """The table of an experiment: columns with the names of the kind, in the stated units.
+def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> list[tuple[str, RawTable]]:
+    """The tables of an experiment, one for each text of the column ``split_by``, after that text; else one, after "".
+
+    Their columns have the names of the kind, in the stated units.
 
     Files with the same headers are put one below the other; else side by side, and a column that several of them hold
     must be the same within rounding.
@@ -451,7 +459,19 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
     units = tuple("s" if source.unit == STAMP else source.unit for source in column_map.sources.values())
     raw = RawTable(names, units, tuple(values[name] for name in names), rows, place)
     other = int(np.sum(~keep & ~missing))
-    return raw if keep.all() else replace(raw.taken(np.flatnonzero(keep)), lost=rows[missing], other=other)
+    raw = raw if keep.all() else replace(raw.taken(np.flatnonzero(keep)), lost=rows[missing], other=other)
+    return [("", raw)] if column_map.layout.split_by is None else _by_texts(entry["split_by"], parts, raw, keep)
+
+
+def _by_texts(split_by: Node, parts: Sequence["_Part"], raw: RawTable, keep: np.ndarray) -> list[tuple[str, RawTable]]:
+    """The rows that are kept for each text of the column that ``split_by`` names, after that text."""
+    header = _header_named(split_by.value, parts)
+    texts = np.concatenate([part.find(split_by, header, texts=True)[0] for part in parts])[keep]
+    names, owners = np.unique(texts, return_inverse=True)
+    if "" in names:
+        rule = f"split_by needs a text in every row of {split_by.value}"
+        raise raw.error(int(np.argmin(owners)), raw.names[0], rule, "none", "fill it")
+    return [*zip(map(str, names), raw.divided(owners), strict=True)]
 
 
 class _Part:
@@ -539,9 +559,7 @@ class _Part:
 def _selected_by(parts: Sequence[_Part], node: Node, wanted: Wanted) -> tuple[np.ndarray, np.ndarray]:
     """The rows whose column, named by the key of ``node``, has what is ``wanted``, and those without a value, (n,)."""
     key, is_text = node.key, isinstance(wanted, str)
-    stated = any(key in row for part in parts for export in part.exports for row in export.headers)
-    number = key.isascii() and key.isdigit() and int(key) > 0 and not stated
-    header: Header = int(key) if number else " ".join(key.split())
+    header = _header_named(key, parts)
     column = np.concatenate([part.find(node, header, is_text)[0] for part in parts])
     if isinstance(wanted, str):
         rows, unknown = column == wanted, column == ""
@@ -559,6 +577,13 @@ def _selected_by(parts: Sequence[_Part], node: Node, wanted: Wanted) -> tuple[np
             else "write one of the values of the column",
         )
     return rows, unknown
+
+
+def _header_named(key: str, parts: Sequence[_Part]) -> Header:
+    """The header that ``key`` is, or the number of a column where no header is that."""
+    stated = any(key in row for part in parts for export in part.exports for row in export.headers)
+    number = key.isascii() and key.isdigit() and int(key) > 0 and not stated
+    return int(key) if number else " ".join(key.split())
 
 
 def _held(column: np.ndarray, wanted: Wanted) -> str:

@@ -3,7 +3,7 @@
 import hashlib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path, PureWindowsPath
 from types import MappingProxyType
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from capsule_id.parameters import ROUNDING, TABLE_1, Parameter, Prior
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
 from capsule_id.rig.formats.text import is_stamp
-from capsule_id.rig.guess import find_layout, proposal
+from capsule_id.rig.guess import find_layout, fits_name, proposal
 from capsule_id.rig.maps import (
     MAP_KEYS,
     apply_map,
@@ -363,8 +364,8 @@ def read_tables(
     plateaus, seen = read_plateaus(entry, kind), list[Finding]()
     column_map = read_map(entry, kind, partial(_proposal, first, kind))
     if column_map is None:
-        raw = _read_plain(nodes[0], first, contents.pop(nodes[0].value), kind)
-        encodings = {nodes[0].value: raw.encoding}
+        parts = [("", _read_plain(nodes[0], first, contents.pop(nodes[0].value), kind))]
+        encodings = {nodes[0].value: parts[0][1].encoding}
     else:
         # Plateaus replace the time by the column of their levels.
         names = tuple(column_map.sources)
@@ -374,7 +375,7 @@ def read_tables(
         exports = {
             name: EXPORTS[suffix_of(file)](contents.pop(name), file, column_map.layout) for name, file in files.items()
         }
-        raw = apply_map(entry, list(exports.values()), column_map)
+        parts = apply_map(entry, list(exports.values()), column_map)
         encodings = {name: export.encoding for name, export in exports.items()}
         for name, export in exports.items():
             if "sheet" in entry and not export.sheet:
@@ -384,9 +385,40 @@ def read_tables(
                 seen.append(Finding("readings.sheets", "ok", facts))
         del exports
     if column_map is not None and any(source.unit == STAMP for source in column_map.sources.values()):
-        seen.append(Finding("times.stamps", "ok", {"file": nodes[0].value, "rows": len(raw.rows)}))
-    tables = _records(entry, kind, label, settings, raw, plateaus, tuple(seen))
+        rows = sum(len(raw.rows) for _, raw in parts)
+        seen.append(Finding("times.stamps", "ok", {"file": nodes[0].value, "rows": rows}))
+    tables = list[tuple[Table, RawTable]]()
+    for own, here, raw in _parted(entry, label, settings, parts):
+        tables += _records(entry, kind, own, here, raw, plateaus, () if tables else tuple(seen))
     return [(replace(table, encodings=encodings), written) for table, written in tables], hashes
+
+
+def _parted(
+    entry: Node, label: str, settings: Settings, parts: Sequence[tuple[str, RawTable]]
+) -> Iterable[tuple[str, Settings, RawTable]]:
+    """Label, settings and rows of each part of an experiment, by its text in the column ``split_by``.
+
+    The direction is backward where the text says so.
+
+    Raises
+    ------
+    InputError
+        If the texts are those of surfaces, which one fit of friction cannot have.
+    """
+    ends = [
+        re.sub("[^A-Za-z0-9._-]+", "_", normalize("NFKD", name).encode("ascii", "ignore").decode()) for name, _ in parts
+    ]
+    ends = ends if len({*ends}) == len(ends) else [str(k + 1) for k in range(len(ends))]
+    for end, (name, raw) in zip(ends, parts, strict=True):
+        directed = bool(name) and "direction" in vars(settings)
+        if directed and fits_name(split := entry["split_by"].text(), "surface") > 0:
+            rule = "one fit has one surface: the rows of one alone may be used"
+            raise entry["split_by"].error(
+                rule, split, f'write where = {{ "{split}" = "{name}" }} in place of split_by', True
+            )
+        backward = directed and fits_name(name, "backward") > 0
+        here = replace(settings, **{"direction": "backward"}) if backward else settings
+        yield f"{label}_{end}" if name else label, here, raw
 
 
 def _records(

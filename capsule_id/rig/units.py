@@ -99,7 +99,7 @@ def _registry() -> Any:
 #: Written for a unit that a file does not state, and for times of day.
 UNKNOWN, STAMP = "?", "stamp"
 #: Units of the output of a sensor.
-_SIGNALS = ("V", "mV")
+SIGNALS = ("V", "mV")
 
 
 @cache
@@ -124,7 +124,7 @@ def factor_to_si(unit: str, si: str) -> float:
         raise UnitError("a unit is a product of symbols, e.g. kN/m, N*s/m or m/s^2 (1: no unit)", remedy)
     for symbol in _SYMBOL.findall(written):
         if symbol not in _DEFINITIONS:
-            if _known(symbol) in _SIGNALS and si != "1":
+            if _known(symbol) in SIGNALS and si != "1":
                 remedy += f" and the factor to it: columns = {{ ... = {{ from = 1, unit = ..., scale = ... }} }}, per {symbol}"
                 raise UnitError(f"a reading in {symbol} needs the sensitivity of its sensor", remedy)
             meant = _SYMBOL.sub(lambda found: _known(found[0]), written)

@@ -181,6 +181,23 @@ def test_init_takes_an_empty_folder_and_no_other(tmp_path: Path) -> None:
         assert (tmp_path / "empty folder" / "rig.toml").read_bytes() == before
 
 
+def test_init_states_the_masses(tmp_path: Path) -> None:
+    assert call(init, str(tmp_path / "a"), "--m1", "110", "0.5", "g", "--m2", "0.53", "0", "kg") == 0
+    text = (tmp_path / "a" / "rig.toml").read_text()
+    assert '\nm1 = { value = 110, sd = 0.5, unit = "g" }\n' in text
+    assert '\nm2 = { value = 0.53, sd = 0, unit = "kg" }\n' in text
+    for words in (
+        ("heavy", "1", "g"),
+        ("110", "0.5", "mm"),
+        ("-1", "0", "kg"),
+        ("1", "2", "kg"),
+        ("1 }\nx = 1", "0", "g"),
+    ):
+        with pytest.raises(InputError):
+            call(init, str(tmp_path / "b"), "--m1", *words)
+    assert not (tmp_path / "b").exists()
+
+
 def test_check_prints_a_line_per_experiment(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert call(check, str(write_folder(tmp_path / "rig"))) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -132,3 +132,22 @@ def test_a_file_without_a_column_of_numbers_is_refused_and_headers_command_no_te
     out = capsys.readouterr().out
     assert "evil" in out
     assert all(mark.isprintable() or mark == "\n" for mark in out)
+
+
+def test_a_trace_of_a_pull_is_no_table_of_pulls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before: 500 samples of one pull passed for 500 pulls, and their mean for the break-away force."""
+    time = np.arange(500) / 100.0
+    pull = 0.5 + np.where(time < 4.0, time, 2.2) + 0.02 * np.random.default_rng(1).standard_normal(500)
+    rows = "".join(f"{t:.2f},{f:.4f}\n" for t, f in zip(time, pull, strict=True))
+    (tmp_path / "pull.csv").write_text("time [s],force [N]\n" + rows, encoding="utf-8")
+    words = ["init", str(tmp_path / "rig"), "--m1", "0.1", "0", "kg", "--m2", "0.5", "0", "kg"]
+    assert cli.capsule_id([*words, "--from", str(tmp_path / "pull.csv")]) == 0
+    capsys.readouterr()
+    assert cli.capsule_id(["check", str(tmp_path / "rig")]) == 2
+    said = message(capsys.readouterr().err)
+    assert "static_friction must be a table of trials, a record against time, read angle," in said
+    (tmp_path / "rig" / "pull.csv").write_text("force [N]\n4.5\n4.4\n4.6\n", encoding="utf-8")
+    toml = tmp_path / "rig" / "rig.toml"
+    entry = re.sub(r"\[experiment.columns\].*", "", toml.read_text(encoding="utf-8"), flags=re.DOTALL)
+    toml.write_text(entry, encoding="utf-8")  # the remedy: a row per trial
+    assert cli.capsule_id(["check", str(tmp_path / "rig")]) == 0

@@ -5,14 +5,30 @@
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
-from capsule_id.rig.formats.binary import read_hdf5, read_mat, read_npz, read_parquet, read_tdms, read_xlsx
+from capsule_id.rig.formats.binary import (
+    OCTAVE,
+    read_hdf5,
+    read_mat,
+    read_npz,
+    read_octave,
+    read_parquet,
+    read_tdms,
+    read_xlsx,
+)
 from capsule_id.rig.formats.layouts import read_lvm, read_text
 from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout
 from capsule_id.rig.formats.text import read_csv
 
-TEXTS = {**dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), read_text), ".lvm": read_lvm}
+
+def _unless_octave(read: Callable[[bytes, Path, Layout], Export], content: bytes, path: Path, layout: Layout) -> Export:
+    """A file that Octave may have written, whatever its suffix, or one for ``read``."""
+    return (read_octave if content.startswith(OCTAVE) else read)(content, path, layout)
+
+
+TEXTS = {**dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), partial(_unless_octave, read_text)), ".lvm": read_lvm}
 
 
 def suffix_of(path: Path) -> str:
@@ -25,7 +41,7 @@ READERS = dict.fromkeys((suffix + end for suffix in (".csv", ".txt", ".tsv") for
 EXPORTS: Mapping[str, Callable[[bytes, Path, Layout], Export]] = {
     **TEXTS,
     **{suffix + COMPRESSED: read for suffix, read in TEXTS.items()},
-    ".mat": read_mat,
+    ".mat": partial(_unless_octave, read_mat),
     ".npz": read_npz,
     ".h5": read_hdf5,
     ".hdf5": read_hdf5,

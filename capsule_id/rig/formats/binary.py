@@ -5,6 +5,7 @@ import itertools
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -30,6 +31,7 @@ from capsule_id.rig.formats.raw import (
     Export,
     Layout,
     Place,
+    TextFile,
     complete,
     export_of_arrays,
     largest,
@@ -264,6 +266,30 @@ def _read_variables(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
 
 
 read_hdf5 = read_mat = partial(_read_arrays, _in_process, "export it again", "")
+
+
+# octave: Reads the text that GNU Octave saves by default: each variable behind its name and type.
+
+
+OCTAVE = b"# Created by Octave"
+_VARIABLE = re.compile(
+    r"^# name: (\S+)\n# type: (matrix|scalar|(?:double_)?range)\n((?:(?!# name: ).*\n)*)", re.MULTILINE
+)
+
+
+def _octave(content: bytes, path: Path) -> Named:
+    """The real variables of a file, and the fields of its structs."""
+    for name, kind, body in _VARIABLE.findall("\n".join([*TextFile(content, path).lines(), ""])):
+        rows = [line.split() for line in body.split("\n") if line.strip() and not line.startswith("#")]
+        values = np.array(rows, float)
+        if kind.endswith("range"):
+            first, last, step = values.ravel()[:3]
+            refuse_large(READING * (samples := round((last - first) / step) + 1), content, path)
+            values = first + step * np.arange(samples)
+        yield name, values, ""
+
+
+read_octave = partial(_read_arrays, _octave, "save it again by save -v7", "")
 
 
 # npz: Reads NumPy archives: every real numeric array is a column, or a matrix. Pickled objects are never loaded.

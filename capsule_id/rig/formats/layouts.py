@@ -83,7 +83,8 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     width = len(cells) + (not trailing)
     refuse_wide(width, path, first + 1)
     above = range((layout.data_from_line or first + 1) - 2, -1, -1)
-    found = [(i, names) for i in above if (names := _headers(head[i], delimiter, width))]
+    named = row.lstrip().startswith('"')  # R writes no header above the names of its rows
+    found = [(i, names) for i in above if (names := _headers(head[i], delimiter, width, named))]
     headers = tuple(names for _, names in found)
     wanted = [k for k in range(width) if layout.columns is None or is_wanted(k, headers, layout.columns)]
     decimal = "." if delimiter == "," else layout.decimal
@@ -192,12 +193,13 @@ def _mapped(cells: list[str], lines: list[str], layout: Layout) -> list[str]:
     return [cells[k] for k in wanted if not is_wanted(k, headers, layout.words)] or cells
 
 
-def _headers(line: str, delimiter: str | None, width: int) -> tuple[str, ...]:
-    """The headers in a line above the numbers; () if it holds none."""
+def _headers(line: str, delimiter: str | None, width: int, named: bool = False) -> tuple[str, ...]:
+    """The headers in a line above the numbers; () if it holds none. Above rows that are ``named`` the first may be left out."""
     bare = line.lstrip(" " if delimiter == "\t" else BLANKS).lstrip("".join(COMMENTS))  # a first cell may be empty
     for cells in _header_cells(bare, delimiter):
         if len(cells) == width + 1 and not cells[-1]:
             cells.pop()
+        cells = ["", *cells] if named and len(cells) == width - 1 else cells
         if len(cells) == width and any(cells) and not any(is_number(cell) for cell in cells):
             return tuple(" ".join(cell.split()) for cell in cells)
     return ()

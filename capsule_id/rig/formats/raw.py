@@ -114,6 +114,11 @@ COMPRESSED = ".gz"
 BLOCK = 1 << 20
 WINDOWS = "Windows-1252"
 _CODECS = {"UTF-16": "utf-16", WINDOWS: "cp1252"}
+#: A number with commas in quotation marks, and one whose comma can separate thousands.
+_QUOTED, _THOUSANDS = (
+    re.compile(rb'"([+-]?[0-9]+,[0-9,]*(?:\.[0-9]*)?)"'),
+    re.compile(rb"[+-]?[1-9][0-9]{0,2}(?:,[0-9]{3})+"),
+)
 _NOT_WINDOWS = re.compile(rb"[\x81\x8d\x8f\x90\x9d]")
 
 
@@ -142,7 +147,8 @@ class TextFile:
             if self.encoding == "UTF-8"
             else raw.decode(_CODECS[self.encoding]).encode()
         )
-        self._text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
+        text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
+        self._text = _with_points(text.replace(b" -> ", b"\t"))  # behind the time stamps of a serial monitor
         if last is not None:
             ends = np.append(np.flatnonzero(np.frombuffer(self._text, np.uint8) == ord("\n")), len(self._text))
             self._text = self._text[: ends[min(last, len(ends)) - 1] + 1]
@@ -183,6 +189,18 @@ class TextFile:
     def line(self, number: int) -> str:
         """Line ``number``, counted from 0; "" where the file has none."""
         return next(self.lines(number), "")
+
+
+def _with_points(text: bytes) -> bytes:
+    """Numbers that stand in quotation marks between commas, "1,234.5" or "0,25", as 1234.5 or 0.25.
+
+    Which of the two a file means its numbers must show: "1,234" alone stays as it is.
+    """
+    found = [] if b'";' in text or b'"\t' in text else _QUOTED.findall(text)
+    thousands = any(b"." in number for number in found)
+    if not found or thousands != all(_THOUSANDS.fullmatch(number.split(b".")[0]) for number in found):
+        return text
+    return _QUOTED.sub(lambda one: one[1].replace(b",", b"" if thousands else b"."), text)
 
 
 def _bytes_of(content: bytes, path: Path) -> bytes:
@@ -325,6 +343,7 @@ class Layout:
     columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
     words : headers, or numbers counted from 1, of those whose texts it keeps too
     sheet : name of the sheet of a workbook (None: the first one with numbers)
+    split_by : header, or number, of the column each text of which is an experiment
     """
 
     data_from_line: int | None = None
@@ -334,6 +353,7 @@ class Layout:
     columns: tuple[str | int, ...] | None = None
     words: tuple[str | int, ...] = ()
     sheet: str | None = None
+    split_by: str | None = None
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,17 @@ from capsule_id.views import counted
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
+#: A number whose thousands are separated; by decimal mark, one that shows by which mark they are.
+_GROUPED = re.compile(
+    "[+-]?[1-9][0-9]{0,2}(?P<mark>[.,'\u2019 \u00a0\u202f])[0-9]{3}(?:(?P=mark)[0-9]{3})*(?:[.,][0-9]*)?"
+)
+_SHORT = re.compile("[+-]?[0-9]{1,3}")
+#: Cells such as 1,234 among which whole numbers show that their comma separates thousands.
+FEWEST_APART = 20
+_APART = {
+    mark: re.compile(rf"(?m)^[+-]?[1-9][0-9]{{0,2}}(?:(?:{other}[0-9]{{3}})+[{mark}]|(?:{other}[0-9]{{3}}){{2,}}$)")
+    for mark, other in ((",", "[.]"), (".", ","))
+}
 # Only with such an exponent may a number be below the smallest float64: its cells are then read one by one.
 _TINY = re.compile("[eE]-0*(?:[1-9][0-9]{3}|[3-9][0-9]{2})")
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
@@ -64,8 +75,14 @@ def bare(cell: str) -> str:
     return cell.strip(BLANKS).strip('"')
 
 
-def number_in(cell: str, decimal: str) -> float | None:
-    """The number in a cell with the decimal mark ``decimal``, None if it is no plain number."""
+def number_in(cell: str, decimal: str, apart: bool = False) -> float | None:
+    """The number in a cell with the decimal mark ``decimal``, None if it is no plain number.
+
+    Its thousands may be separated; by a point or a comma alone only where it is known that they are ``apart``: 1,234.
+    """
+    if (found := _GROUPED.fullmatch(cell)) and (mark := found["mark"]) != decimal:
+        sure = apart or mark not in ".," or decimal in cell or cell.count(mark) > 1
+        cell = cell.replace(mark, "") if sure else cell
     written = cell.translate(_SWAP_MARKS) if decimal == "," else cell
     return None if _NUMBER.fullmatch(written) is None else float(written)
 
@@ -107,9 +124,15 @@ def is_beyond_floats(value: float, written: str) -> bool:
 
 
 def decimal_mark(texts: Sequence[str], missing: Sequence[str]) -> str | None:
-    """The first point or comma of the cells of a column, None where they have none."""
-    found = re.search("[.,]", "\n".join(text for text in texts if text not in missing))
-    return found[0] if found else None
+    """The first point or comma of the cells of a column that separates no thousands, None where they have none."""
+    written = "\n".join(text for text in texts if text not in missing)
+    found = re.search("[.,]", written)
+    return next(mark_apart(written), found[0] if found else None)
+
+
+def mark_apart(written: str) -> Iterator[str]:
+    """The decimal mark of lines with numbers such as 1.234,5 or 1,234,567, which show how their thousands are separated."""
+    return (mark for mark, pattern in _APART.items() if pattern.search(written))
 
 
 def read_column(
@@ -141,10 +164,11 @@ def read_column(
             values[used] = [float(texts[k].replace(mark, ".")) for k in used]
             if np.isfinite(values[used]).all() and (values[used].all() or not _TINY.search("\n".join(texts))):
                 return values
+    apart = mark in mark_apart("\n".join(texts))
     for k, text in enumerate(texts):
         if text in missing:
             continue
-        value = number_in(text, mark)
+        value = number_in(text, mark, apart)
         if value is None:
             raise InputError(
                 "a cell must be a number",
@@ -371,7 +395,7 @@ def rows_of(
     """
     rows = Rows({column: [] for column in columns}, {column: [] for column in words})
     markers, marks = missing or (), dict.fromkeys(columns, shape.decimal)
-    alone = not words and are_words(markers)
+    alone, apart = not words and are_words(markers), None
     for number, block in file.blocks(shape.first):
         # No other decimal mark than that of the reader in C can be meant.
         plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
@@ -389,8 +413,10 @@ def rows_of(
             continue
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         turned = [*zip(*cells, strict=True)] or [()] * shape.width
+        apart = (_apart(turned, markers) if shape.decimal is None else {}) if apart is None else apart
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
+            texts = [text.replace(apart[column], "") for text in texts] if column in apart else texts
             if column in words:
                 rows.texts[column] += map(sys.intern, texts)
             marks[column] = marks[column] or decimal_mark(texts, markers)
@@ -404,6 +430,22 @@ def rows_of(
             except InputError as error:
                 rows.numbers[column].append(error)
     return rows
+
+
+def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str]) -> dict[int, str]:
+    """The point or the comma between thousands, by column, where all cells with it may be such numbers: 1,234 and 998.
+
+    Other columns show the other mark, or many cells with it stand beside whole numbers of three digits at most.
+    """
+    marks, lone = dict[int, str](), dict[int, bool]()
+    for k, texts in enumerate(columns):
+        if (mark := decimal_mark(texts := [bare(text) for text in texts], missing)) is not None:
+            marked, marks[k] = [text for text in texts if mark in text], mark
+            whole = len(marked) >= FEWEST_APART and any(_SHORT.fullmatch(text) for text in texts)
+            if all((found := _GROUPED.fullmatch(text)) and text[-4] == found["mark"] for text in marked):
+                lone[k] = whole
+    shown = {mark for k, mark in marks.items() if k not in lone}
+    return {k: marks[k] for k, whole in lone.items() if whole or shown == {*",."} - {marks[k]}}
 
 
 def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:

@@ -216,3 +216,23 @@ def test_the_error_that_a_check_of_loads_states_is_seen_in_8_of_10_cases(rows: i
 def test_too_few_rows_see_no_error() -> None:
     p, unseen = added_effect(np.array([0.3, -0.3]), np.ones((2, 1)), np.array([1.0, 0.5]))
     assert (p, unseen[0]) == (1.0, np.inf)
+
+
+@pytest.mark.parametrize(("loop", "level"), [(0.0, "ok"), (0.04, "warn")])
+def test_loading_and_unloading_are_compared(tmp_path: Path, loop: float, level: str) -> None:
+    """A spring loaded and unloaded: the finding names both branches, and k2 of both holds the truth within its sd."""
+    up, rng = np.linspace(0.1, 2.0, 12), np.random.default_rng(1)
+    x = np.concatenate([up, up[::-1][1:]])
+    y = 19.0 * x - np.where(np.arange(23) < 12, 0.0, loop * 76.0 * x * (1.0 - x / 2.0)) + 0.05 * rng.standard_normal(23)
+    columns = {"deflection [mm]": x, "force [N]": y}
+    entry = Entry("support_spring", "spring", columns, {"spring": '"a"'})
+    result = cid.fit(make_rig(tmp_path / "loop", entry), budget=None)
+    (found,) = [f for f in result.findings if f.code == "lines.branches"]
+    assert found.level == level
+    k2 = result["k2[a]"]
+    assert abs(k2.value - 19e3) < 3.0 * k2.sd
+    if loop:
+        assert "hysteresis" in result.text(found)
+        assert found.facts["rising"] == pytest.approx(19e3, rel=0.01)
+        assert 0.01 < found.facts["share"] < 0.1
+        assert k2.trust != "trusted"

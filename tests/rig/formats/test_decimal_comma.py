@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.rig.test_column_maps import DISP, TIME, assert_read, fault_of, rig_of, rows
 
@@ -34,19 +35,51 @@ MAP_BY_NUMBER = 'columns = { time = { from = 1, unit = "s" }, x_rel = { from = 2
 
 
 def test_quoted_decimal_commas_are_not_cut_in_two(tmp_path: Path) -> None:
-    """Cut at the comma, the second column would be the decimals of the first; the remedy gives the right numbers."""
+    """Cut at the comma, the second column would be the decimals of the first."""
     cells = [(f"{t:.2f}".replace(".", ","), f"{x:.4f}".replace(".", ",")) for t, x in zip(TIME, DISP, strict=True)]
-    quoted = "".join(f'"{t}","{x}"\n' for t, x in cells)
     lines = f'file = "x.csv"\n{MAP_BY_NUMBER}'
-    fault = fault_of(tmp_path, {"x.csv": quoted}, lines)
+    for mark in ",;":
+        assert_read(rig_of(tmp_path, {"x.csv": "".join(f'"{t}"{mark}"{x}"\n' for t, x in cells)}, lines))
+
+
+def test_quoted_commas_that_may_separate_thousands_are_refused(tmp_path: Path) -> None:
+    """Nothing says whether "1,234" is 1234 or 1.234; one cell with both marks does."""
+    lines = f'file = "x.csv"\n{MAP_BY_NUMBER}'
+    ambiguous = "".join(f'"{i},234","{i},5{i:02}"\n' for i in range(1, 13))
+    fault = fault_of(tmp_path, {"x.csv": ambiguous}, lines)
     assert (fault.file, fault.line) == (str(tmp_path / "x.csv"), 1)
     assert "quotation marks" in fault.rule
     assert "semicolons" in fault.remedy
-    assert_read(rig_of(tmp_path, {"x.csv": "".join(f'"{t}";"{x}"\n' for t, x in cells)}, lines))
+    (table,) = rig_of(tmp_path, {"x.csv": ambiguous + '"13,000","1,234.5"\n'}, lines).tables
+    np.testing.assert_allclose(table["time"][[0, -1]], [1234.0, 13000.0])
+    np.testing.assert_allclose(table["x_rel"][[0, -1]], [1.501, 1.2345])
+    mixed = ambiguous + '"13,5","1,234.5"\n'
+    assert "quotation marks" in fault_of(tmp_path, {"x.csv": mixed}, lines).rule
 
 
-def test_a_hard_space_separates_nothing(tmp_path: Path) -> None:
-    """A number with a thousands space is refused and never two numbers."""
-    text = "".join(f"{i}\u00a0234,5 {i}\n" for i in range(1, 13))
-    fault = fault_of(tmp_path, {"x.txt": text}, f'file = "x.txt"\n{MAP_BY_NUMBER}')
-    assert "rows of numbers" in fault.rule
+@pytest.mark.parametrize("mark", ["\u00a0", "\u202f", "'", "\u2019"])
+def test_a_hard_space_or_an_apostrophe_separates_thousands(tmp_path: Path, mark: str) -> None:
+    text = "".join(f"{i}{mark}234,5 {i}\n" for i in range(1, 13))
+    (table,) = rig_of(tmp_path, {"x.txt": text}, f'file = "x.txt"\n{MAP_BY_NUMBER}').tables
+    np.testing.assert_allclose(table["time"], 1000.0 * np.arange(1, 13) + 234.5)
+
+
+def test_points_or_commas_separate_thousands_where_a_cell_shows_it(tmp_path: Path) -> None:
+    """Negative control: a column with both marks that shows nothing is refused, and a lone 1.234 is what it was."""
+    lines = f'file = "x.csv"\n{MAP_BY_NUMBER}'
+
+    def text(*cells: str) -> dict[str, str | bytes]:
+        return {"x.csv": "".join(f"{k},5;{cell}\n" for k, cell in enumerate((*cells, *["7"] * 8)))}
+
+    (table,) = rig_of(tmp_path, text("999,5", "1.000", "1.001,5"), lines).tables
+    np.testing.assert_allclose(table["x_rel"][:3], [0.9995, 1.0, 1.0015])
+    alone = {"x.csv": "".join(f"{k};{1 + k / 100:.3f}\n" for k in range(12))}
+    (table,) = rig_of(tmp_path, alone, lines).tables
+    np.testing.assert_allclose(table["x_rel"][:2], [1e-3, 1.01e-3])
+    for cells in (("0.5", "1,234"), ("999,5", "1.234"), ("1,5", "1,234.5,6")):
+        assert "must be a number" in fault_of(tmp_path, text(*cells), lines).rule
+    # Another column shows the decimal mark, or whole numbers stand among many of three decimals.
+    for cells in ({f"{k / 8:.3f};{1000 + k:,}" for k in range(30)}, {f"{k};{985 + k:,}" for k in range(60)}):
+        ordered = sorted(cells, key=lambda row: float(row.split(";")[0]))
+        (table,) = rig_of(tmp_path, {"x.csv": "\n".join(ordered) + "\n"}, lines).tables
+        assert 0.98 < table["x_rel"].min() <= table["x_rel"].max() < 1.06
