@@ -9,7 +9,7 @@ from pathlib import Path
 from capsule_id.commands import NO_CACHE, PATH, QUIET, rig_folders
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.rigs import fit_many, fit_one
-from capsule_id.console import Progress, say
+from capsule_id.console import Progress, fit_stages, say
 from capsule_id.errors import InputError, check_seed
 from capsule_id.experiments.kind import CHOICES, Registry, default_registry
 from capsule_id.rig.model import Rig
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     if args.scheduler is not None:
         raise InputError("--scheduler is for several rigs", "one rig", "remove it, or name further folders")
     directory = args.out or root / rigs[0].name
-    with Progress(not args.quiet) as progress:
+    with Progress(not args.quiet, stages=fit_stages(args.budget is not None)) as progress:
         return fit_one(rigs[0], args, directory, kinds, progress)
 
 

@@ -109,7 +109,6 @@ def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, prog
         # A fit of bench tests ends as soon.
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
         result = make_fit(rig, options, kinds, unfinished / CHAINS, progress, preliminary)
-        progress(0, 1, "report")
         write_result(result_files(result), unfinished)
         publish(unfinished, directory)
     saved.clear()
