@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import ArrayLike
 
-from capsule_id.console import OnProgress, Progress
+from capsule_id.console import OnProgress, Progress, fit_stages
 from capsule_id.errors import InputError
 from capsule_id.experiments.friction_model import friction_of
 from capsule_id.experiments.kind import Choice, Registry, default_registry, make_experiments
@@ -500,17 +500,21 @@ def fit(
         raise InputError("ess must be positive and finite", str(ess), f"give {DEFAULT_ESS:.0f}, the default")
     kinds, seeds = registry or default_registry(), stage_seeds(seed)
     made_from = provenance(rig, seed, experiments, friction_of(rig, friction, contact).source)
-    with Progress(progress) if isinstance(progress, bool | None) else nullcontext(progress) as show:
-        show(0, 1, "point fit")
+    stages = fit_stages(budget is not None)
+    with Progress(progress, stages=stages) if isinstance(progress, bool | None) else nullcontext(progress) as show:
+        show(0, 1, "readings")
         readings = check_readings(rig, experiments, kinds)
         made, second = second_models(make_experiments(rig, experiments, kinds, friction, contact), readings)
         target = LogPosterior(rig, made)
         check_profiled(target, profile)
+        show(0, 1, "point fit")
         point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
         before = (*readings, *second)
         if preliminary is not None and budget is not None:
             preliminary(make_result(unfinished(point, before), kinds, seeds.report, made_from, Fit, panels=False))
-        checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, show, ess), before)
+        sampled = sample_posterior(point, seeds.walkers, budget, store, show, ess)
+        show(0, 1, "report")
+        checked = check_fit(sampled, before)
         return make_result(checked, kinds, seeds.report, made_from, Fit, profiled=profile)
 
 

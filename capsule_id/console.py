@@ -3,6 +3,7 @@
 import errno
 import io
 import logging
+import math
 import os
 import re
 import shutil
@@ -13,12 +14,12 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import chdir, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
+from types import FrameType, MappingProxyType
 from typing import Any
 
 from capsule_id.errors import InputError, OutputError, printable
@@ -155,8 +156,10 @@ _COLOURS = {"ok": 32, "trusted": 32, "warn": 33, "not judged": 33, "fail": 31, "
 _COLOURED = re.compile(r"^(?:ok|warn|fail)(?=[ :])|\b(?:not trusted|not judged|trusted)\b", re.MULTILINE)
 #: Longest message of an exception in an error line, characters.
 LONGEST_MESSAGE = 300
-#: Width of the bar in a notebook, characters.
-NOTEBOOK_WIDTH = 100
+#: Width of a line in a notebook, and of the longest bar, characters; least share of the work that gives a time left.
+NOTEBOOK_WIDTH, LONGEST_BAR, LEAST_SHARE = 100, 30, 0.1
+#: Stages of a fit with a sample, and the share of the time that each takes on ``data/``.
+FIT_STAGES = {"readings": 0.03, "point fit": 0.4, "burn-in": 0.2, "sampling": 0.3, "report": 0.07}
 
 
 def prepare() -> None:
@@ -255,18 +258,30 @@ def save_traceback(error: BaseException) -> str:
     return f"traceback in {file.name}"
 
 
+def fit_stages(sampled: bool) -> dict[str, float]:
+    """Stages of a fit and their shares of its duration, as measured on ``data/``."""
+    return {name: share for name, share in FIT_STAGES.items() if sampled or name not in ("burn-in", "sampling")}
+
+
 class Progress:
-    """Stage, rate and time left: a bar on a terminal or in a notebook, a line every ``FILE_INTERVAL`` in a file.
+    """Stage, share done and time left: a bar on a terminal or in a notebook, a line every ``FILE_INTERVAL`` in a file.
+
+    The share never falls and the time left never rises while one bar lasts.
 
     enabled : None: on a terminal and in a notebook
+    unit : what is counted where ``stages`` is empty
+    stages : names and shares of the stages that one bar covers; else a bar lasts until a new stage counts from below
     """
 
-    def __init__(self, enabled: bool | None = None, unit: str = "draw") -> None:
+    def __init__(
+        self, enabled: bool | None = None, unit: str = "draw", stages: Mapping[str, float] = MappingProxyType({})
+    ) -> None:
         # A kernel's streams take no escape codes: there the bar is an output that is replaced.
         self._notebook = type(sys.stderr).__module__.startswith("ipykernel.")
         self._terminal = sys.stderr.isatty() or self._notebook
-        self._enabled, self._unit = self._terminal if enabled is None else enabled, unit
-        self._stage, self._began, self._first, self._shown = "", 0.0, 0, 0.0
+        self._enabled, self._unit, self._stages = self._terminal if enabled is None else enabled, unit, dict(stages)
+        self._stage, self._began, self._shown = "", 0.0, 0.0
+        self._first, self._share, self._left = 0.0, 2.0, math.inf
         self._open = self._displayed = False
 
     def __enter__(self) -> "Progress":
@@ -279,13 +294,19 @@ class Progress:
         """Show ``done`` of ``total`` draws (or points) in ``stage``; a stage without a count has total 1."""
         if not self._enabled:
             return
-        now = time.monotonic()
-        if stage != self._stage:
+        now, share, known = time.monotonic(), done / max(total, 1), list(self._stages)
+        if stage in known:
+            before = sum(self._stages[name] for name in known[: known.index(stage)])
+            share = (before + share * self._stages[stage]) / sum(self._stages.values())
+        fresh = stage != self._stage
+        if self._share > 1.0 or (fresh and stage not in known and share < self._share):
             self._end_line()
-            self._stage, self._began, self._first = stage, now, done
-        elif now - self._shown < (TERMINAL_INTERVAL if self._terminal else FILE_INTERVAL):
+            self._began, self._first, self._share, self._left = now, share, share, math.inf
+        elif not fresh and now - self._shown < (TERMINAL_INTERVAL if self._terminal else FILE_INTERVAL):
             return
-        self._shown = now
+        self._stage, self._shown, self._share = stage, now, max(self._share, share)
+        if (passed := self._share - self._first) > LEAST_SHARE:
+            self._left = min(self._left, (now - self._began) * (1.0 - self._share) / passed)
         self._show(self._line(done, total, now - self._began))
 
     def note(self, text: str) -> None:
@@ -297,13 +318,20 @@ class Progress:
             self._end_line()
 
     def _line(self, done: int, total: int, elapsed: float) -> str:
-        if total <= 1:
-            return f"{self._stage} ..."
-        from tqdm import tqdm
-
-        width = NOTEBOOK_WIDTH if self._notebook else shutil.get_terminal_size().columns - 1 if self._terminal else None
-        plain = not self._terminal
-        return tqdm.format_meter(done, total, elapsed, width, self._stage, plain, self._unit, initial=self._first)
+        known, words = list(self._stages), self._stage
+        if words in known:
+            words = f"{known.index(words) + 1} of {len(known)}: {words}{_compiling() if words == 'point fit' else ''}"
+        elif total > 1:
+            rate = f", {(self._share - self._first) * total / elapsed:.3g} {self._unit}s/s" if elapsed > 0.0 else ""
+            words = f"{words}: {done}/{total}{rate}"
+        else:
+            return f"{words} ..."
+        left = "" if math.isinf(self._left) else f", {_clock(self._left)} left"
+        end = f" {math.floor(100.0 * self._share)} %, {_clock(elapsed)}{left}"
+        width = NOTEBOOK_WIDTH if self._notebook else shutil.get_terminal_size().columns - 1
+        room = min(width - len(words) - len(end) - 3, LONGEST_BAR) if self._terminal else 0
+        full = int(room * self._share)
+        return f"{words} [{'#' * full}{'.' * (room - full)}]{end}" if room > 0 else f"{words}{end}"
 
     def _show(self, line: str) -> None:
         line = printable(line)
@@ -324,3 +352,18 @@ class Progress:
             with suppress(OSError):
                 sys.stderr.write("\n")
             self._open = False
+
+
+def _clock(seconds: float) -> str:
+    """A duration as minutes and seconds, rounded up."""
+    return "{:02d}:{:02d}".format(*divmod(math.ceil(seconds), 60))
+
+
+def _compiling() -> str:
+    """Words for a point fit that compiles its programs, "" where a cache holds programs of an earlier one."""
+    directory = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if not directory:
+        return ", compiling"
+    with suppress(OSError):
+        return "" if any(Path(directory).iterdir()) else ", compiling (once per machine)"
+    return ", compiling"

@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING
 from capsule_id.commands import NO_CACHE, PATH, QUIET, rig_folders
 from capsule_id.commands.bifurcate import client_of
 from capsule_id.commands.compilation import prepare_jax
-from capsule_id.console import OnProgress, Progress, complain, one_line, save_traceback, saved, say, stop_if_interrupted
+from capsule_id.console import (
+    OnProgress,
+    Progress,
+    complain,
+    fit_stages,
+    one_line,
+    save_traceback,
+    saved,
+    say,
+    stop_if_interrupted,
+)
 from capsule_id.errors import InputError, check_seed
 from capsule_id.experiments.kind import CHOICES, Registry, default_registry, make_experiments
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress, write_file
@@ -115,7 +125,6 @@ def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, prog
         # A fit of bench tests ends as soon.
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
         result = make_fit(rig, options, kinds, unfinished / CHAINS, progress, preliminary)
-        progress(0, 1, "report")
         write_result(result_files(result), unfinished)
         publish(unfinished, directory)
     saved.clear()
@@ -317,7 +326,7 @@ def run(args: argparse.Namespace) -> int:
     if args.scheduler is not None:
         raise InputError("--scheduler is for several rigs", "one rig", "remove it, or name further folders")
     directory = args.out or root / rigs[0].name
-    with Progress(not args.quiet) as progress:
+    with Progress(not args.quiet, stages=fit_stages(args.budget is not None)) as progress:
         return fit_one(rigs[0], args, directory, kinds, progress)
 
 

@@ -314,7 +314,7 @@ def sample(
     ess : bulk and tail effective sample size of every parameter at which the sampling stops
     """
     report = progress or (lambda done, total, text: None)
-    report(0, 1, "pilot")
+    report(0, 1, "burn-in")
     pilot_seed, *seeds = (int(s) for s in np.random.SeedSequence(seed).generate_state(ENSEMBLES + 1))
     schedule = pilot(target, pilot_seed)
     with nullcontext() if store is None else ChainStore(store, f"{target.fingerprint} {seed}") as chains:
@@ -329,7 +329,7 @@ def sample(
             for done in _advance(samplers, goal, schedule.thin):
                 if chains is not None:
                     chains.between_draws()
-                report(done, ENSEMBLES * goal, schedule.move)
+                report(done, ENSEMBLES * goal, "sampling")
             draws, lp = _completed(target, samplers, goal)
             if _converged(draws, ess):
                 break

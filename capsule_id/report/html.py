@@ -35,7 +35,7 @@ from capsule_id.report.columns import (
     verdict_text,
 )
 from capsule_id.report.figures import fits as figures
-from capsule_id.report.figures.style import figure_of, mark, new_axes, new_figure, png
+from capsule_id.report.figures.style import figure_of, mark, new_axes, new_figure, png, svg
 from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, question_of, title_of
 from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, after_number, counted
 
@@ -64,7 +64,7 @@ class Picture:
     section : "measured", "sample" or "point_fit"
     title, caption : plain text
     width, height : of the page's picture, CSS pixels
-    png : the file
+    png, svg : the file, and the picture of the page where it is none of many points
     alt : what is seen, for readers who do not see it
     group : label of the experiment, "" for figures of the whole fit
     """
@@ -78,6 +78,7 @@ class Picture:
     png: bytes
     alt: str = ""
     group: str = ""
+    svg: bytes = b""
 
     @property
     def wide(self) -> bool:
@@ -97,7 +98,8 @@ def pictures(result: Result) -> tuple[Picture, ...]:
         if result.rig.synthetic:
             mark(figure, "synthetic data")
         width, height = (round(96 * inches) for inches in figure.get_size_inches())
-        drawn.append(Picture(name, section, title, caption, width, height, png(figure), alt, group))
+        file = png(figure)
+        drawn.append(Picture(name, section, title, caption, width, height, file, alt, group, svg(figure, len(file))))
     return tuple(drawn)
 
 
@@ -399,7 +401,9 @@ _ENVIRONMENT.filters |= {
     "symbol_parts": symbol_parts,
     "fixed": fixed,
     "number": _number,
-    "embed": lambda picture: "data:image/png;base64," + base64.b64encode(picture.png).decode("ascii"),
+    "embed": lambda picture: (
+        f"data:image/{'svg+xml' if picture.svg else 'png'};base64,{base64.b64encode(picture.svg or picture.png).decode()}"
+    ),
     "after_number": after_number,
 }
 

@@ -219,9 +219,9 @@ def test_progress_has_a_rate_and_the_time_left(capsys: pytest.CaptureFixture[str
     lines = capsys.readouterr().err.splitlines()
     assert "0/4" in lines[0]
     with Progress(enabled=True, unit="point") as progress:
-        progress._stage, progress._began = "points", -100.0
-        assert "point/s" in progress._line(50, 100, 10.0)
-        assert "<00:10" in progress._line(50, 100, 10.0)
+        progress._stage, progress._first, progress._share, progress._left = "points", 0.0, 0.5, 10.0
+        assert "50/100, 5 points/s" in progress._line(50, 100, 10.0)
+        assert "00:10 left" in progress._line(50, 100, 10.0)
 
 
 def test_the_commands_of_the_guide_are_understood() -> None:

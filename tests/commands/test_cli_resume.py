@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 import xarray as xr
 
 from capsule_id.cli import fit_params
-from capsule_id.console import Progress
+from capsule_id.console import Progress, fit_stages
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.output import CHAINS
 from capsule_id.report.html import pictures
@@ -106,7 +107,7 @@ def test_an_ensemble_never_repeats_itself(here: Path) -> None:
     ("stage", "draws"),
     [
         pytest.param("point fit", 0, marks=pytest.mark.full),
-        pytest.param("pilot", 0, marks=pytest.mark.full),
+        pytest.param("burn-in", 0, marks=pytest.mark.full),
         pytest.param("e", 1, marks=pytest.mark.slow),
         ("e", 35),
         pytest.param("e", 100, marks=pytest.mark.slow),
@@ -242,8 +243,8 @@ def test_progress_in_a_file_is_sparse_and_on_a_terminal_has_rate_and_end(
     lines = capsys.readouterr().err.splitlines()
     assert 9 <= len(lines) <= 11
     assert all("move" in line and "\r" not in line for line in lines)
-    assert "2.00draw/s" in lines[-1]
-    assert "<01:4" in lines[-1]
+    assert ", 2 draws/s 4" in lines[-1]
+    assert lines[-1].endswith(", 01:50 left")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with Progress(enabled=True) as progress:
         for done in range(1, 4):
@@ -253,6 +254,51 @@ def test_progress_in_a_file_is_sparse_and_on_a_terminal_has_rate_and_end(
     with Progress(enabled=False) as progress:
         progress(1, 400, "move")
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_one_bar_covers_a_fit_and_never_goes_back(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], terminal: bool
+) -> None:
+    """Stages that last longer than planned, and a goal that moves away: share and time left stay or improve."""
+    clock = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", os.devnull)
+    with Progress(enabled=True, stages=fit_stages(sampled=True)) as progress:
+        for stage, total, pause in (("readings", 1, 3.0), ("point fit", 1, 90.0), ("burn-in", 1, 1.0)):
+            progress(0, total, stage)
+            clock[0] += pause
+        progress.note("a table")
+        for goal in (100, 300, 1000):
+            for done in range(goal // 3, goal, 10):
+                progress(done, goal, "sampling")
+                clock[0] += 11.0
+        progress(0, 1, "report")
+    text = capsys.readouterr().err
+    assert "2 of 5: point fit, compiling" in text
+    shares = [int(share) for share in re.findall(r"(\d+) %", text)]
+    left = [60 * int(m) + int(s) for m, s in re.findall(r"(\d+):(\d+) left", text)]
+    assert len(shares) > len(left) > 40
+    assert shares == sorted(shares)
+    assert left == sorted(left, reverse=True)
+    assert shares[-1] == 93
+    if not terminal:
+        assert "\r" not in text
+        assert text.replace("\n", "").isprintable()
+    else:
+        assert text.count("\n") == 3  # before the note, after it, at the end: one bar
+
+
+def test_programs_are_said_to_be_compiled_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    for expected in ("point fit, compiling (once per machine) ", "point fit "):
+        with Progress(enabled=True, stages=fit_stages(sampled=False)) as progress:
+            progress(0, 1, "point fit")
+        assert f"2 of 3: {expected}" in capsys.readouterr().err
+        (tmp_path / "program").touch()
 
 
 def _remove(folder: Path) -> None:

@@ -92,6 +92,41 @@ def test_it_fits_a_phone(unclean: Result, drawn: tuple[Picture, ...], tmp_path: 
     assert cut == 0  # no text of a finding begins or ends outside
 
 
+#: Opens all parts, enlarges the first figure, says what it sees, goes back by Escape; also texts that are cut or overlap.
+ZOOM = """<script>
+for (const part of document.querySelectorAll("details")) part.open = true;
+const image = document.querySelector("figure img"), before = image.width;
+image.click();
+const box = image.parentElement.getBoundingClientRect();
+const seen = [image.width / before > 2, box.width >= innerWidth - 20, image.parentElement.scrollWidth > box.width];
+dispatchEvent(new KeyboardEvent("keydown", {key: "Escape"}));
+const boxes = [...document.querySelectorAll("h1, h2, h3, figcaption, .findings .text, .findings .asked, .verdict, td, th, dd")]
+  .filter(item => item.textContent.trim() && item.checkVisibility())
+  .map(item => [item, item.getBoundingClientRect(), item.closest(".scroll")]);
+const cut = boxes.filter(([item, b, scroll]) => !scroll && (b.left < 0 || b.right > innerWidth
+  || item.scrollWidth > item.clientWidth + 1));
+const crossed = boxes.filter(([one, a, s], i) => !s && boxes.some(([other, b, t], j) => i < j && !t && !one.contains(other)
+  && Math.min(a.right, b.right) - Math.max(a.left, b.left) > 1 && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 1));
+document.title = JSON.stringify([...seen, image.width === before, boxes.length > 100, cut.length, crossed.length]);
+</script>"""
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_figures_are_enlarged_and_opened_parts_cut_no_text(
+    unclean: Result, drawn: tuple[Picture, ...], tmp_path: Path, width: int
+) -> None:
+    text = render(unclean, drawn).replace("</body>", ZOOM + "</body>")
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    (tmp_path / "report.html").write_text(
+        f'<title>none</title><iframe src="page.html" style="width: {width}px; height: 800px; border: 0" '
+        'onload="document.title = this.contentDocument.title"></iframe>',
+        encoding="utf-8",
+    )
+    document, messages = browse(tmp_path / "report.html")
+    assert messages == []
+    assert re.findall(r"<title>(.*?)</title>", document) == ["[true,true,true,true,true,0,0]"]
+
+
 def test_few_pages_are_printed_unless_parts_are_opened(
     result: Result, drawn: tuple[Picture, ...], tmp_path: Path
 ) -> None:

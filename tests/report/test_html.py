@@ -5,6 +5,7 @@ import html
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -73,8 +74,26 @@ def test_self_contained(page: str, drawn: tuple[Picture, ...]) -> None:
     assert set(anchors) <= {value for key, value in parsed.attributes if key == "id"}
     sources = [value for key, value in parsed.attributes if key == "src"]
     assert len(sources) == len(drawn)
-    assert all(source.startswith("data:image/png;base64,iVBORw0KGgo") for source in sources)
+    assert all(
+        source.startswith(("data:image/png;base64,iVBORw0KGgo", "data:image/svg+xml;base64,")) for source in sources
+    )
     assert not [key for key, _ in parsed.attributes if key.startswith("on")]
+
+
+def test_lines_are_svg_in_the_colours_of_the_page_and_load_nothing(page: str, drawn: tuple[Picture, ...]) -> None:
+    """A cloud of points stays PNG; the page grows by no more than a half."""
+    by_name = {picture.name: picture for picture in drawn}
+    assert all(by_name[name].svg for name in ("friction", "support_spring_soft"))
+    assert not any(by_name[name].svg for name in ("free_vibration_1", "corner"))
+    for picture in drawn:
+        root = ElementTree.fromstring(picture.svg or b"<svg/>")
+        values = [value for item in root.iter() for key, value in item.attrib.items() if not key.startswith("xmlns")]
+        assert not [value for value in values if "http" in value or value.startswith(("#ffffff", "fill: #ffffff"))]
+        assert b"fill: #000000" not in picture.svg
+        assert b"url(" not in picture.svg.replace(b"url(#", b"")
+        assert len(picture.svg) <= 1.5 * len(picture.png)
+    assert b"prefers-color-scheme: dark" in by_name["friction"].svg
+    assert "synthetic data" in by_name["friction"].svg.decode()
 
 
 def test_every_number_of_the_table_is_there(result: Result, page: str) -> None:

@@ -78,14 +78,15 @@ def test_files(folder: Path, result: Result) -> None:
     assert figures == {f"figures/{label}.png" for label in labels}
 
 
-def test_figures_are_those_of_the_page_at_150_dpi(folder: Path) -> None:
+def test_figures_are_those_of_the_page_at_150_dpi(folder: Path, drawn: tuple[Picture, ...]) -> None:
     from base64 import b64encode
 
     from PIL import Image
 
     page = (folder / "report.html").read_text(encoding="utf-8")
     for path in (folder / "figures").glob("*.png"):
-        assert b64encode(path.read_bytes()).decode() in page
+        shown = next(picture for picture in drawn if picture.name == path.stem)
+        assert b64encode(shown.svg or path.read_bytes()).decode() in page
         with Image.open(path) as image:
             assert image.info["dpi"] == pytest.approx((150, 150), abs=0.1)
             assert image.convert("RGB").getpixel((1, image.height - 2)) == (255, 255, 255)

@@ -70,8 +70,7 @@ def comparison(item: Comparison, ax: Axes) -> None:
     for points in item.points:
         _draw_points(ax, points)
     set_text(ax, item.x_label, item.y_label, item.title)
-    # Finding the best place means testing every point: for a record that takes longer than drawing it.
-    set_legend(ax, "upper right" if long else "best")
+    set_legend(ax)
 
 
 def residuals(item: Comparison, ax: Axes) -> None:

@@ -1,6 +1,7 @@
 """How every figure looks: colours, type sizes, margins, legends, and the way to PNG bytes."""
 
 import io
+import re
 import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -19,7 +20,7 @@ from PIL import Image
 # ``matplotlib.figure.Figure`` objects and leave no global state. A panel is a function ``(data, ax)`` that draws.
 
 
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+WHITE, BLACK, ORANGE, SKY, GREEN = "#ffffff", "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#6B6B6B"
 PALE_BLUE = "#BBD6EA"
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
@@ -30,10 +31,11 @@ _PALETTE, _NEARLY_WHITE = 128, 253
 TEXT, SMALL = 11.0, 9.5
 #: Heights of an entry of a legend and of its margins, and the largest part of the panel for both.
 _ENTRY, _MARGINS, _MOST_ROOM = 1.5 * SMALL, 2.0 * SMALL, 0.5
+#: Most entries of a legend over the curves in one column.
+_ONE_COLUMN = 3
 
-#: Where a legend stands: in the panel, over its curves, over the panel in one row at the right, or beside it.
+#: Where a legend stands: over the curves of its panel, over the panel in one row at the right, or beside it.
 _PLACES: dict[str, dict[str, Any]] = {
-    "best": {"loc": "best"},
     "upper right": {"loc": "upper right"},
     "above": {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1},
     "beside": {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.3},
@@ -93,27 +95,37 @@ def set_text(ax: Axes, x_label: str, y_label: str, title: str = "", *, size: flo
 
 def set_legend(
     ax: Axes,
-    place: Literal["best", "upper right", "above", "beside"] = "best",
+    place: Literal["upper right", "above", "beside"] = "upper right",
     handles: Sequence[Artist] = (),
     **look: Any,
 ) -> float:
     """A legend of ``handles``, by default of the labelled artists, as plain text.
 
-    "upper right" makes space over the curves. Returns the part of the panel's height below that space.
+    "upper right" makes space over the curves, with two columns for many entries. No legend covers data. Returns the part
+    of the panel's height below that space.
     """
     shown, below = handles or ax.get_legend_handles_labels()[0], 1.0
     if not shown:
         return below
+    columns = len(shown) if place == "above" else 2 if place == "upper right" and len(shown) > _ONE_COLUMN else 1
     if place == "upper right":
         height = 72.0 / figure_of(ax).dpi * ax.get_window_extent().height
-        below -= min((len(shown) * _ENTRY + _MARGINS) / height, _MOST_ROOM)
+        below -= min((-(-len(shown) // columns) * _ENTRY + _MARGINS) / height, _MOST_ROOM)
         low, high = ax.get_ylim()
         ax.set_ylim(low, low + (high - low) / below)
-    columns = len(shown) if place == "above" else 1
     looks = {"fontsize": SMALL, "frameon": False, "handlelength": 1.8, "ncols": columns, **_PLACES[place], **look}
     for text in ax.legend(handles=shown, **looks).get_texts():
         text.set_parse_math(False)
     return below
+
+
+#: Largest SVG, in sizes of the PNG of the same figure; lines are below it, clouds of points far above.
+_LARGEST_SVG = 1.5
+#: Colours of an SVG by those of the figure: its paper is that of the page, and it follows the dark mode of the browser.
+_THEMED = {WHITE: "none", BLACK: "currentColor", BLUE.lower(): "var(--blue)", GREY.lower(): "var(--grey)"}
+_THEME = """<style>:root { color: #1b1b1b; fill: currentColor; --blue: #0072b2; --grey: #6b6b6b; }
+@media screen and (prefers-color-scheme: dark) { :root { color: #e6e4df; --blue: #56a9dd; --grey: #a5a5a5; } }
+text { font-family: "DejaVu Sans", Verdana, system-ui, sans-serif !important; }</style>"""
 
 
 def mark(figure: Figure, text: str) -> None:
@@ -136,3 +148,24 @@ def png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     small.save(buffer, format="PNG", dpi=(DPI, DPI))
     return buffer.getvalue()
+
+
+def svg(figure: Figure, most: int) -> bytes:
+    """The figure as SVG in the colours of the page; b"" beyond ``_LARGEST_SVG`` times ``most`` bytes, its size as PNG.
+
+    This is the rule of every picture of the page: SVG for lines, PNG for clouds of points.
+    """
+    buffer = io.StringIO()
+    with warnings.catch_warnings(), rc_context({"svg.fonttype": "none", "svg.hashsalt": "capsule-id"}):
+        warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = re.sub(
+        r"<metadata>.*?</metadata>|<!--.*?-->|<\?xml.*?\?>|<!DOCTYPE.*?>", "", buffer.getvalue(), flags=re.DOTALL
+    )
+    # A hundredth of a point is not seen.
+    text = re.sub(r"(-?\d+\.\d\d)\d+", r"\1", text)
+    text = re.sub(r"\s+", " ", text)
+    for colour, themed in _THEMED.items():
+        text = text.replace(f": {colour}", f": {themed}")
+    made = re.sub(r"(<svg [^>]*>)", lambda head: head[1] + _THEME, text, count=1).strip().encode()
+    return made if len(made) <= _LARGEST_SVG * most else b""

@@ -204,7 +204,7 @@ def test_interrupted_chains_go_on(tmp_path: Path) -> None:
 def test_progress_is_reported() -> None:
     seen: list[tuple[int, int, str]] = []
     sample(KNOWN, 1, 300, None, lambda *args: seen.append(args))
-    assert seen[0] == (0, 1, "pilot")
+    assert seen[0] == (0, 1, "burn-in")
     assert all(0 <= done <= goal for done, goal, _ in seen)
     assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
 
