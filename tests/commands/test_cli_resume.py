@@ -108,9 +108,9 @@ def test_an_ensemble_never_repeats_itself(here: Path) -> None:
     [
         pytest.param("point fit", 0, marks=pytest.mark.full),
         pytest.param("burn-in", 0, marks=pytest.mark.full),
-        pytest.param("e", 1, marks=pytest.mark.slow),
-        ("e", 35),
-        pytest.param("e", 100, marks=pytest.mark.slow),
+        pytest.param("sampling", 1, marks=pytest.mark.slow),
+        ("sampling", 35),
+        pytest.param("sampling", 100, marks=pytest.mark.slow),
         pytest.param("report", 0, marks=pytest.mark.full),
     ],
 )
@@ -163,7 +163,7 @@ def test_killed_inside_emcee_and_spoilt_afterwards(here: Path, monkeypatch: pyte
 )
 def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPatch, damage: str) -> None:
     with monkeypatch.context() as patch:
-        die_in_progress(patch, "e", 80, lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+        die_in_progress(patch, "sampling", 80, lambda: (_ for _ in ()).throw(KeyboardInterrupt))
         assert fit_params([*WORDS, "--out", "out"]) == 130
     file = here / "out.partial" / CHAINS
     content = file.read_bytes()
