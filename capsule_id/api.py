@@ -452,6 +452,16 @@ def read_rig(
     return read.read_rig(folder, registry or default_registry(), own)
 
 
+def _check_numbers(seed: int, budget: int | None, ess: float) -> None:
+    """Refuse numbers of a fit that are out of range."""
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")
+    if budget is not None and budget < 1:
+        raise InputError("budget must be positive", str(budget), "give 1 or more steps, or None: the point fit alone")
+    if not 0 < ess < float("inf"):
+        raise InputError("ess must be positive and finite", str(ess), f"give {DEFAULT_ESS:.0f}, the default")
+
+
 def fit(
     rig: Rig | str | Path,
     seed: int = 0,
@@ -492,12 +502,7 @@ def fit(
     """
     prepare_xla()
     rig = rig if isinstance(rig, Rig) else read_rig(rig, registry, friction, contact)
-    if not isinstance(seed, int) or seed < 0:
-        raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")
-    if budget is not None and budget < 1:
-        raise InputError("budget must be positive", str(budget), "give 1 or more steps, or None: the point fit alone")
-    if not 0 < ess < float("inf"):
-        raise InputError("ess must be positive and finite", str(ess), f"give {DEFAULT_ESS:.0f}, the default")
+    _check_numbers(seed, budget, ess)
     kinds, seeds = registry or default_registry(), stage_seeds(seed)
     made_from = provenance(rig, seed, experiments, friction_of(rig, friction, contact).source)
     stages = fit_stages(budget is not None)
