@@ -159,7 +159,7 @@ LONGEST_MESSAGE = 300
 #: Width of a line in a notebook, and of the longest bar, characters; least share of the work that gives a time left.
 NOTEBOOK_WIDTH, LONGEST_BAR, LEAST_SHARE = 100, 30, 0.1
 #: Stages of a fit with a sample, and the share of the time that each takes on ``data/``.
-FIT_STAGES = {"readings": 0.03, "point fit": 0.4, "burn-in": 0.2, "sampling": 0.3, "report": 0.07}
+FIT_STAGES = {"readings": 0.02, "point fit": 0.45, "burn-in": 0.08, "sampling": 0.1, "report": 0.35}
 
 
 def prepare() -> None:
