@@ -325,8 +325,9 @@ def test_the_examples_in_python_give_what_they_say(capsys: pytest.CaptureFixture
         exec(block, names)
         (promised,) = re.findall(r"print\(.*\)  # (\S+)", block)
         assert capsys.readouterr().out.split() == [promised]
-    # Those of the results are below; that of a kind is installed and fitted in tests/experiments/test_plugin.py.
-    others = [block for name in ("results", "extending") for block in blocks("python", GUIDE[name])]
+    # Those of the results are below; that of a kind is installed and fitted in tests/experiments/test_plugin.py; scripts
+    # are typed and run in tests/test_typed.py.
+    others = [block for name in ("results", "extending", "scripts") for block in blocks("python", GUIDE[name])]
     assert len(examples) == EVERYTHING.count("```python") - len(others) == 3
 
 
