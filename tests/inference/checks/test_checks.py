@@ -147,7 +147,8 @@ def test_tests_of_lines_keep_their_level(tmp_path: Path) -> None:
     bent, struck = [], []
     for seed in range(120):
         for line in lines(seed, tmp_path / str(seed)):
-            bent.append(curvature_test(line, at_truth(line), [])[1] < 0.1)
+            sd = line.misfit(at_truth(line)).sd
+            bent.append(curvature_test(line.x, line.observed, sd, line.scale_known)[1] < 0.1)
             struck.append(bool(outliers(line, at_truth(line), 0.1)))
     bound = 4.0 * np.sqrt(0.1 * 0.9 / len(bent))
     assert np.mean(bent) == pytest.approx(0.1, abs=bound)
