@@ -21,6 +21,7 @@ from capsule_id.inference.checks.settings import ORDER_LEVEL, SMALLEST_CORRELATI
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.records.tones import SIGNIFICANT, VISIBLE
 from capsule_id.report.columns import table_rows, verdict_text
+from capsule_id.report.figures.style import figure_of, new_axes, svg
 from capsule_id.report.html import Picture, pictures, render
 from capsule_id.report.messages import QUESTIONS, TERMS, finding_text, messages_of, question_of
 from capsule_id.views import Finding, Message, ResultTable, Text
@@ -78,6 +79,18 @@ def test_self_contained(page: str, drawn: tuple[Picture, ...]) -> None:
         source.startswith(("data:image/png;base64,iVBORw0KGgo", "data:image/svg+xml;base64,")) for source in sources
     )
     assert not [key for key, _ in parsed.attributes if key.startswith("on")]
+
+
+def test_the_numbers_of_a_line_figure_are_those_of_its_axes() -> None:
+    """Before: every tick of this axis read 0.00, because the places of lines and the texts were shortened alike."""
+    ax = new_axes()
+    ax.plot([0.0, 1.0], [0.0, 0.008])
+    ax.set_title("k = 1.23456")
+    (figure := figure_of(ax)).canvas.draw()
+    written = {text.get_text() for text in (*ax.get_xticklabels(), *ax.get_yticklabels(), ax.title)}
+    assert {"0.001", "0.007", "k = 1.23456"} <= written
+    shown = set(re.findall(r"<text[^>]*>([^<]*)</text>", svg(figure, 1_000_000).decode()))
+    assert {"0.001", "0.007", "k = 1.23456"} <= shown <= written
 
 
 def test_lines_are_svg_in_the_colours_of_the_page_and_load_nothing(page: str, drawn: tuple[Picture, ...]) -> None:

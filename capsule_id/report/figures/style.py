@@ -162,8 +162,8 @@ def svg(figure: Figure, most: int) -> bytes:
     text = re.sub(
         r"<metadata>.*?</metadata>|<!--.*?-->|<\?xml.*?\?>|<!DOCTYPE.*?>", "", buffer.getvalue(), flags=re.DOTALL
     )
-    # A hundredth of a point is not seen.
-    text = re.sub(r"(-?\d+\.\d\d)\d+", r"\1", text)
+    # A hundredth of a point of a line or a marker is not seen. Numbers that are read, in texts, stay as they are.
+    text = re.sub(r' (?:d|x|y)="[^"]*"', lambda place: re.sub(r"(\.\d\d)\d+", r"\1", place[0]), text)
     text = re.sub(r"\s+", " ", text)
     for colour, themed in _THEMED.items():
         text = text.replace(f": {colour}", f": {themed}")
