@@ -80,6 +80,7 @@ class CapsuleForward(GroundExperiment):
     reaction: float = eqx.field(static=True)
 
     event_driven = True
+    slow_to_differentiate = True
     masses = ("m1", "m2")
 
     def set_model(self, table: Table, rig: Rig, friction: FrictionModel) -> None:

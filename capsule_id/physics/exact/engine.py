@@ -165,7 +165,7 @@ GRAZING_RATE = 1e-5
 # A piece of a drive shorter than this part of the time counts as that long: time always goes on.
 SHORTEST_PIECE = 1e-15
 
-# Numbers of samples are padded to this times a power of four.
+# Numbers of samples are padded to this times a power of four, of two inside of a transformation.
 SHORTEST = 64
 
 Kernel = Callable[[CapsuleParameters, Drive, FrictionLaw, Initial, jax.Array], Trajectory]
@@ -385,7 +385,8 @@ def _without_padding(t: Trajectory, n: int) -> Trajectory:
 def kernel(max_steps: int) -> Kernel:
     """The engine (p, e, law, initial, times) -> Trajectory on lanes.
 
-    Concrete times are padded to one of few lengths, so that a new number of samples is seldom a new program.
+    Times are padded to one of few lengths, so that a new number of samples is seldom a new program, and records of a fit
+    that differ little in length are traced once together.
     """
 
     def simulate_exact(
@@ -393,12 +394,12 @@ def kernel(max_steps: int) -> Kernel:
     ) -> Trajectory:
         L, n = times.shape
         bound, t_end = np.full(L, max_steps, np.int32), times[:, -1]
-        if is_traced((p, e, law, initial, times)):
-            return _run(p, e, law, initial, times, t_end, bound)
-        length = next(size for k in range(32) if (size := SHORTEST * 4**k) >= n)
-        padded = np.concatenate([times, np.full((L, length - n), np.inf)], axis=1)
+        traced = is_traced((p, e, law, initial, times))
+        # A program of a fit runs often, and padding by more than twice the samples costs up to 40 % of its time.
+        length = next(size for k in range(64) if (size := SHORTEST * (2 if traced else 4) ** k) >= n)
+        padded = (jnp if traced else np).concatenate([times, np.full((L, length - n), np.inf)], axis=1)
         # The samples of several lanes are scattered; a law, drive or force of the user may hold any operation.
-        single = L == 1 and all(map(_is_own, (e, law, *(p.forces or ()))))
+        single = L == 1 and not traced and all(map(_is_own, (e, law, *(p.forces or ()))))
         given = p, e, law, initial, padded, t_end, bound
         t = _run_single(*given)[0] if single else _run(*given)
         return t if n == length else _without_padding(t, n)

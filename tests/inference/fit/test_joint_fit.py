@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ from capsule_id.inference.joint_fit import (
     scatter_modes,
     weigh,
 )
-from capsule_id.inference.least_squares import Solver, linearised
+from capsule_id.inference.least_squares import Solver, linearised, rows_of
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
@@ -222,6 +223,20 @@ def test_scipy_finds_the_same_minimum() -> None:
         np.testing.assert_allclose(sd, expected, rtol=0.1)
     assert min(distances) < 1e-3
     assert max(distances) < 1.0
+
+
+@pytest.mark.full
+def test_the_differences_of_runs_are_their_derivatives_in_forward_mode() -> None:
+    """Per standard deviation of each parameter, 1e-5 of a residual's. Control: over 10 % of k1 they are not."""
+    target, fit = fitted()
+    sd = np.sqrt(np.diag(fit.covariance))[target.located]
+    exact = np.asarray(jax.jit(jax.jacfwd(lambda u: target.residuals(u)))(jnp.asarray(fit.u)))[:, target.located] * sd
+    np.testing.assert_allclose(linearised(target, fit.u)[1] * sd, exact, atol=1e-5)
+    k1 = target.names.index("k1")
+    step = 0.1 * (np.arange(target.dimension) == k1)
+    ends = np.asarray(rows_of(target, jnp.asarray(np.stack([fit.u + step, fit.u - step]))))
+    column = list(target.located).index(k1)
+    assert np.max(np.abs((ends[0] - ends[1]) / 0.2 * sd[column] - exact[:, column])) > 1e-3
 
 
 def test_scatters_stand_at_their_conditional_maxima() -> None:
