@@ -92,10 +92,9 @@ def permutation_p(values: np.ndarray, statistic: Callable[[np.ndarray], np.ndarr
     The ``number`` of orders are the same ones each time.
     """
     rng, found = np.random.default_rng(0), statistic(values)
-    starts = range(0, number, max(ORDERED // len(values), 1))
-    larger = 0
-    for rows in np.diff([*starts, number]):
-        orders = rng.permuted(np.tile(values, (rows, 1)), axis=1)
+    larger, step = 0, max(ORDERED // len(values), 1)
+    for start in range(0, number, step):
+        orders = rng.permuted(np.tile(values, (min(step, number - start), 1)), axis=1)
         larger += np.sum(statistic(orders) >= found - SAME * np.abs(found))
     return float((1 + larger) / (1 + number))
 

@@ -159,7 +159,7 @@ def svg(figure: Figure, most: int) -> bytes:
     This is the rule of every picture of the page: SVG for lines, PNG for clouds of points.
     """
     lines = (line for line in figure.findobj(Line2D) if line.get_marker() not in ("None", "", " ", None))
-    if _MARKER * sum(len(line.get_xdata()) for line in lines) > _LARGEST_SVG * most:
+    if _MARKER * sum(np.size(line.get_xdata()) for line in lines) > _LARGEST_SVG * most:
         return b""
     buffer = io.StringIO()
     with warnings.catch_warnings(), rc_context({"svg.fonttype": "none", "svg.hashsalt": "capsule-id"}):
