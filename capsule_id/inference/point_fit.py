@@ -143,10 +143,10 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:
         compiled = pool.submit(density, starts[:1])
-        rough = least_squares(partial(linearised, target, starts[0]), starts[:, located], BASIN_SOLVER)
+        rough = least_squares(partial(linearised, target, starts[0]), starts[:, located], BASIN_SOLVER).x
         compiled.result()
     ends = starts.copy()
-    ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
+    ends[:, located] = np.where(np.isfinite(rough), rough, starts[:, located])
     # Least squares knows no scatter: it may end at a lower density than it began with.
     before, after = density(starts), density(ends)
     ends = np.where((after >= before)[:, None], ends, starts)

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from capsule_id.api import read_rig
 from capsule_id.experiments.base import LEVEL
@@ -91,6 +92,19 @@ def test_the_numbers_of_a_line_figure_are_those_of_its_axes() -> None:
     assert {"0.001", "0.007", "k = 1.23456"} <= written
     shown = set(re.findall(r"<text[^>]*>([^<]*)</text>", svg(figure, 1_000_000).decode()))
     assert {"0.001", "0.007", "k = 1.23456"} <= shown <= written
+
+
+def test_a_cloud_of_points_is_not_written_as_svg_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The SVG of 100,000 readings took 100 MB, and was then dropped for its size."""
+    line, points = new_axes(), np.linspace(0.0, 1.0, 3000)
+    line.plot(points, points**2)
+    assert svg(figure_of(line), 60_000)
+    cloud = new_axes()
+    cloud.plot(points, points**2, ls="", marker=".")
+    with monkeypatch.context() as patched:
+        patched.setattr(Figure, "savefig", None)
+        assert svg(figure_of(cloud), 60_000) == b""
+    assert len(svg(figure_of(cloud), 1_000_000)) > 40 * len(points)
 
 
 def test_lines_are_svg_in_the_colours_of_the_page_and_load_nothing(page: str, drawn: tuple[Picture, ...]) -> None:

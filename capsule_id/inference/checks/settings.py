@@ -292,11 +292,18 @@ def _of_loads(s: SampledFit, e: Experiment, p: float) -> Facts:
     The others are permutation tests of the scatter between loads, and of the correlation with the logarithm of the load.
     """
     residuals, (load, coefficient) = _unflagged(s, e)[0], _loads(s, e)
-    means = [(float(one), float(np.mean(coefficient[load == one]))) for one in np.unique(load)]
+    pairs = zip(np.unique(load), at_each_load(coefficient, load), strict=True)
+    means = [(float(one), float(np.mean(own))) for one, own in pairs]
     if len(residuals) >= FEWEST_ROWS:
-        levels = _of_levels([residuals[load == one] for one in np.unique(load)])
+        levels = _of_levels(at_each_load(residuals, load))
         p = 3.0 * min(p, levels, trend(_standardised(residuals, load), load))
     return {"means": means, "p": p}
+
+
+def at_each_load(values: np.ndarray, load: np.ndarray) -> list[np.ndarray]:
+    """Values (n,) of the rows at each load, the lowest first, in the order of the rows; in one pass over the rows."""
+    order = np.argsort(load, kind="stable")
+    return np.split(values[order], np.unique(load[order], return_index=True)[1][1:])
 
 
 def _of_levels(groups: Sequence[np.ndarray]) -> float:
@@ -334,7 +341,7 @@ def _standardised(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
     groups = np.unique(load, return_inverse=True)[1]
     if np.min(np.bincount(groups)) < ROWS_OF_A_LOAD:
         return residuals
-    sd = np.array([np.std(residuals[groups == k], ddof=1) for k in range(np.max(groups) + 1)])
+    sd = np.array([np.std(own, ddof=1) for own in at_each_load(residuals, load)])
     return residuals / np.maximum(sd, SMALLEST_SCATTER)[groups]
 
 

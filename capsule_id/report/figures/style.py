@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
+from matplotlib.lines import Line2D
 from PIL import Image
 
 # Colour-blind-safe colours (Okabe and Ito). Nothing here touches pyplot: figures are plain
@@ -121,6 +122,8 @@ def set_legend(
 
 #: Largest SVG, in sizes of the PNG of the same figure; lines are below it, clouds of points far above.
 _LARGEST_SVG = 1.5
+#: Bytes of a marker in an SVG, at least: the text of 100,000 points is not made in order to be dropped.
+_MARKER = 40
 #: Colours of an SVG by those of the figure: its paper is that of the page, and it follows the dark mode of the browser.
 _THEMED = {WHITE: "none", BLACK: "currentColor", BLUE.lower(): "var(--blue)", GREY.lower(): "var(--grey)"}
 _THEME = """<style>:root { color: #1b1b1b; fill: currentColor; --blue: #0072b2; --grey: #6b6b6b; }
@@ -155,6 +158,9 @@ def svg(figure: Figure, most: int) -> bytes:
 
     This is the rule of every picture of the page: SVG for lines, PNG for clouds of points.
     """
+    lines = (line for line in figure.findobj(Line2D) if line.get_marker() not in ("None", "", " ", None))
+    if _MARKER * sum(np.size(line.get_xdata()) for line in lines) > _LARGEST_SVG * most:
+        return b""
     buffer = io.StringIO()
     with warnings.catch_warnings(), rc_context({"svg.fonttype": "none", "svg.hashsalt": "capsule-id"}):
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)

@@ -9,7 +9,16 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments.point_test import lack_of_fit
-from capsule_id.inference.checks.settings import ORDER_LEVEL, POWER, added_effect, between, heterogeneity, lag_1
+from capsule_id.experiments.statistics import ORDERED, permutation_p
+from capsule_id.inference.checks.settings import (
+    ORDER_LEVEL,
+    POWER,
+    added_effect,
+    at_each_load,
+    between,
+    heterogeneity,
+    lag_1,
+)
 from tests.measured.folders import Entry, make_rig, quantity
 
 
@@ -27,6 +36,27 @@ def test_the_tail_probability_of_random_orders_is_uniform(n: int) -> None:
     p = np.array([lag_1(rng.standard_normal(n))[1] for _ in range(100)])
     assert np.mean(p < 0.1) == pytest.approx(0.1, abs=0.09)
     assert np.mean(p < 0.005) <= 0.02
+
+
+def test_orders_of_a_long_table_are_made_in_parts_and_are_the_same_orders() -> None:
+    """Before: 10,000 orders at once, 16 GB for 100,000 pulls at loads of their own."""
+    values, shapes = np.random.default_rng(2).standard_normal(20_000), list[tuple[int, ...]]()
+
+    def statistic(orders: np.ndarray) -> np.ndarray:
+        shapes.append(orders.shape)
+        return np.sum(orders[..., :50], axis=-1)
+
+    orders = np.random.default_rng(0).permuted(np.tile(values, (300, 1)), axis=1)
+    whole = (1 + np.sum(np.sum(orders[:, :50], axis=1) >= np.sum(values[:50]))) / 301
+    assert permutation_p(values, statistic, 300) == pytest.approx(whole)
+    assert max(map(np.prod, shapes)) <= ORDERED < orders.size
+    assert sum(shape[0] for shape in shapes if len(shape) == 2) == 300
+
+
+def test_rows_at_each_load_keep_their_order() -> None:
+    load, values = np.array([2.0, 5.0, 2.0, 1.0, 5.0]), np.arange(5.0)
+    found = [own.tolist() for own in at_each_load(values, load)]
+    assert found == [values[load == one].tolist() for one in np.unique(load)]
 
 
 def tilts(folder: Path, angle: np.ndarray) -> Fit:
