@@ -24,6 +24,7 @@ from capsule_id.rig.formats.raw import (
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
+    Rows,
     Shape,
     are_words,
     bare,
@@ -33,7 +34,6 @@ from capsule_id.rig.formats.text import (
     is_stamp,
     number_in,
     place_of_cell,
-    read_column,
     rows_of,
     shown_cell,
     texts_of,
@@ -329,12 +329,12 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
     labels, channels = segments[0].keys.get("Y_Unit_Label", []), [name for name in names if name != _TIMES]
     units = dict(zip(channels, labels, strict=False)) if len({*channels}) == len(channels) else {}
     headers += [tuple(units.get(name, "") for name in headers[0])] if any(units.values()) else []
-    stored = _by_cells(text, segments, separator, decimal, layout.missing)
-    lines = np.concatenate([np.arange(segment.first, segment.stop) for segment in segments]) + 1
+    rows = _rows_of_segments(text, segments, separator, decimal, layout.missing)
+    lines = rows.lines
 
     def values(column: int) -> np.ndarray:
         if (source := sources[column]) >= 0:
-            return stored(source)
+            return rows.column(source)
         pairs = zip(clocks[source], segments, strict=True)
         return np.concatenate([start + step * np.arange(part.stop - part.first) for (start, step), part in pairs])
 
@@ -367,28 +367,22 @@ def _clock(segment: _Segment, channel: int, decimal: str | None, path: Path) -> 
     return start, step
 
 
-def _by_cells(
+def _rows_of_segments(
     text: TextFile, segments: Sequence[_Segment], separator: str, decimal: str | None, missing: Sequence[str]
-) -> Callable[[int], np.ndarray]:
-    """The numbers of a column of the file; blank cells at the end of a segment are no readings."""
-    lines = [*text.lines()]
-    tables = [[line.split(separator) for line in lines[segment.first : segment.stop]] for segment in segments]
-
-    def column(index: int) -> np.ndarray:
-        parts = []
-        for segment, rows in zip(segments, tables, strict=True):
-            texts = [row[index].strip(BLANKS + '"') if index < len(row) else "" for row in rows]
-            while len(texts) > 1 and not texts[-1]:
-                texts.pop()
-
-            def place(k: int, first: int = segment.first) -> Place:
-                line = lines[first + k]
-                return text.path, first + k + 1, place_of_cell(line, separator, index, len(line) + 1)
-
-            parts.append(read_column(texts, decimal, missing, place))
-        return np.concatenate(parts)
-
-    return column
+) -> Rows:
+    """The rows of all segments, each with as many cells as there are names; all other lines count as blank."""
+    width, lines = len(segments[0].names), [*text.lines()]
+    table = [""] * len(lines)
+    for number in chain.from_iterable(range(segment.first, segment.stop) for segment in segments):
+        line = lines[number] + separator * width
+        # A row that begins as a comment does is one of cells.
+        table[number] = separator.join(
+            [f'"{line}' if is_comment(line) else line for line in line.split(separator)[:width]]
+        )
+    file, shape = TextFile("\n".join(table).encode(), text.path), Shape(segments[0].first, separator, width, decimal)
+    rows = rows_of(file, shape, range(width), missing)
+    assert rows is not None, "any cell is read with a list of markers"
+    return rows
 
 
 def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segment]]:

@@ -87,35 +87,19 @@ def number_in(cell: str, decimal: str, apart: bool = False) -> float | None:
     return None if _NUMBER.fullmatch(written) is None else float(written)
 
 
-def read_number(cell: str, path: Path, line: int, column: int, decimal: str = ".") -> float:
-    """One cell as a finite number.
-
-    Raises
-    ------
-    InputError
-        At ``line`` and ``column`` if it is no number.
-    """
-    if not cell:
-        remedy = "write a number; a table must have a row without missing cells"
-        raise InputError("a cell must not be empty", "nothing", remedy, path, line, column)
-    value = number_in(cell, decimal)
-    if value is None:
-        if cell.lower().lstrip("+-") in ("inf", "infinity"):
-            raise InputError("a cell must be a finite number", cell, "delete the row", path, line, column)
-        raise InputError(
-            "a cell must be a number",
-            shown_cell(cell),
-            "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file",
-            path,
-            line,
-            column,
-        )
-    if is_beyond_floats(value, cell):
-        rule, remedy = ("finite number", "a smaller number: float64 ends at 1.8e308")
-        if value == 0.0:
-            rule, remedy = "number that float64 holds", "0: float64 begins at 5e-324"
-        raise InputError(f"a cell must be a {rule}", shown_cell(cell), f"write {remedy}", path, line, column)
-    return value
+def no_number(cell: str, value: float | None, place: Place) -> InputError:
+    """The error about a cell that is no number (None), or whose ``value`` float64 does not hold."""
+    infinite = cell.lower().lstrip("+-") in ("inf", "infinity")
+    missing = f"or add {json.dumps(cell, ensure_ascii=False)} to missing = [...] to drop its row"
+    plain = "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file"
+    causes = (
+        (value == 0.0, "number that float64 holds", "write 0: float64 begins at 5e-324"),
+        (value is not None, "finite number", "write a smaller number: float64 ends at 1.8e308"),
+        (infinite, "finite number", "delete the row"),
+        (True, "number", f"{plain}, {missing}"),
+    )
+    rule, remedy = next((rule, remedy) for holds, rule, remedy in causes if holds)
+    return InputError(f"a cell must be a {rule}", shown_cell(cell), remedy, *place)
 
 
 def is_beyond_floats(value: float, written: str) -> bool:
@@ -165,18 +149,11 @@ def read_column(
             if np.isfinite(values[used]).all() and (values[used].all() or not _TINY.search("\n".join(texts))):
                 return values
     apart = mark in mark_apart("\n".join(texts))
-    for k, text in enumerate(texts):
-        if text in missing:
-            continue
-        value = number_in(text, mark, apart)
-        if value is None:
-            raise InputError(
-                "a cell must be a number",
-                shown_cell(text),
-                f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row",
-                *place(k),
-            )
-        values[k] = read_number(text, *place(k), mark) if is_beyond_floats(value, text) else value
+    for k in used:
+        value = number_in(texts[k], mark, apart)
+        if value is None or is_beyond_floats(value, texts[k]):
+            raise no_number(texts[k], value, place(k))
+        values[k] = value
     return values
 
 
@@ -458,14 +435,15 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
     cells = texts_of(text, shape.delimiter)
     cells = cells[:-1] if shape.trailing else cells
     if len(cells) != shape.width:
+        commas = " (a decimal comma needs semicolons or tabs between the cells)" * (shape.delimiter == ",")
+        ends = f"state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if they begin here"
         raise InputError(
-            f"a row must have {counted(shape.width, 'cell')}, as line {shape.first + 1} has",
+            f"a row must have {counted(shape.width, 'cell')}, as {f'line {shape.first + 1}' if line > shape.first else 'the header'} has",
             counted(len(cells), "cell"),
-            f"correct the row, or state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if "
-            f"they begin here",
+            f"correct the row{commas}, or {ends}",
             path,
             line + 1,
-            1,
+            place_of_cell(text, shape.delimiter, shape.width, len(text) + 1),
         )
     return cells
 
@@ -479,6 +457,8 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
 # 1-based: the line of the file, and the character of that line at which the cell begins.
 
 
+_HEAD = "head each column `name [unit]`"
+_BLANK = ("lines between the first and the last must not be blank", "a blank line", "remove the line")
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 
 
@@ -498,45 +478,57 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     file = TextFile(content, path)
     header = file.line(0)
     if not header.strip():
-        first = (
-            "lines between the first and the last must not be blank",
-            "a blank line",
-            "put the header on the first line",
-        )
-        if not any(line.strip() for line in file.lines()):
-            first = (
-                "a table must not be empty",
-                "no text at all",
-                "write a header `name [unit]` per column and one row per reading",
-            )
-        raise InputError(*first, path, 1, 1)
+        empty = ("a table must not be empty", "no text at all", f"{_HEAD} and write a row per reading")
+        raise InputError(*(_BLANK if any(line.strip() for line in file.lines()) else empty), path, 1, 1)
     delimiter = next((mark for mark in "\t;," if mark in header), ",")
     refuse_wide(header.count(delimiter) + 1, path, 1)
     names, units = _header(header, delimiter, path)
     marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")
     shape = Shape(1, delimiter, len(names), decimal)
-    rows = rows_of(file, shape, range(len(names)))
-    end = 1 + len(rows.lines) if rows else 1
-    # Rows that follow one another, with blank lines alone below them.
-    whole = rows and end in rows.lines[-1:].tolist() and not any(line.strip() for line in file.lines(end))
-    columns = tuple(map(rows.column, range(len(names)))) if rows and whole else _read_cells(file, shape)
+    rows = rows_of(file, shape, range(len(names)), NO_READING)
+    assert rows is not None, "any cell is read with a list of markers"
+    lines, empty = rows.lines, _lines_without_cells(file, rows.lines)
 
     def place(row: int | None, column: int) -> Place:
-        line = 0 if row is None else row + 1
+        line = 0 if row is None else int(lines[row]) - 1
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    raw = RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
-    missing = np.any(np.isnan(columns), axis=0)
+    raw = RawTable(names, units, tuple(map(rows.column, range(len(names)))), lines, place, file.encoding)
+    missing = np.any(np.isnan(raw.columns), axis=0)
     if missing.all():  # the first cell of the first row that holds none
-        read_number("", *raw.place(0, int(np.argmax([np.isnan(column[0]) for column in columns]))))
-    return replace(raw.taken(np.flatnonzero(~missing)), lost=raw.rows[missing]) if missing.any() else raw
+        here = raw.place(0, int(np.argmax([np.isnan(column[0]) for column in raw.columns])))
+        remedy = "write a number; a table must have a row without missing cells"
+        raise InputError("a cell must not be empty", "nothing", remedy, *here)
+    lost = np.sort(np.append(lines[missing], empty).astype(int))
+    return replace(raw.taken(np.flatnonzero(~missing)), lost=lost) if len(lost) else raw
+
+
+def _lines_without_cells(file: TextFile, rows: np.ndarray) -> list[int]:
+    """1-based lines, besides the ``rows`` of a table, that hold separators alone.
+
+    Raises
+    ------
+    InputError
+        If there are no rows, at a comment, or at a blank line above the last row.
+    """
+    if not len(rows):
+        raise InputError("a table must have rows", "a header only", "add a row per reading", file.path, 1, 1)
+    if len(rows) == sum(text.count(b"\n") for _, text in file.blocks(1)):
+        return []
+    known = {*rows.tolist()}
+    others = [(number, text.strip()) for number, text in enumerate(file.lines(1), 2) if number not in known]
+    for number, text in others:
+        comment = ("a row must be numbers", shown_cell(text), "remove comments from the table")
+        if is_comment(text) or (not text and number < rows[-1]):
+            raise InputError(*(comment if text else _BLANK), file.path, number, 1)
+    return [number for number, text in others if text]
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names and units of the columns."""
     units: dict[str, str] = {}
-    remedy = "head each column `name [unit]`, e.g. `time [s]` ([1]: no unit)"
+    remedy = f"{_HEAD}, e.g. `time [s]` ([1]: no unit)"
     for cell, column in cells_of(line, delimiter):
         bare = cell[1:-1].strip() if len(cell) > 1 and cell[0] == cell[-1] == '"' else cell
         if not bare:
@@ -550,52 +542,3 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
             )
         units[found[1]] = found[2].strip()
     return tuple(units), tuple(units.values())
-
-
-def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
-    """The columns, read cell by cell, with NaN at missing ones; raises at the first fault."""
-    path, columns, mark, blank = file.path, shape.width, shape.decimal or ".", None
-    values = array("d")
-
-    @lru_cache(1 << 16)  # short cells are many, but many of them are the same
-    def number(cell: str) -> float:
-        value = number_in(cell, mark)
-        return math.nan if value is None or is_beyond_floats(value, cell) else value
-
-    for line, text in enumerate(file.lines(shape.first), shape.first + 1):
-        if not text.strip():
-            blank = blank or line
-            continue
-        if blank is not None:
-            raise InputError(
-                "lines between the first and the last must not be blank",
-                "a blank line",
-                "remove the line",
-                path,
-                blank,
-                1,
-            )
-        cells = texts_of(text, shape.delimiter)
-        if text.lstrip().startswith("#"):
-            raise InputError(
-                "a row must be numbers", shown_cell(text.strip()), "remove comments from the table", path, line, 1
-            )
-        if len(cells) != columns:
-            remedy = "give every row one cell per header"
-            if shape.delimiter == "," and len(cells) == 2 * columns:
-                remedy += " (a decimal comma needs semicolons or tabs between the cells)"
-            raise InputError(
-                f"a row must have {counted(columns, 'cell')}",
-                counted(len(cells), "cell"),
-                remedy,
-                path,
-                line,
-                place_of_cell(text, shape.delimiter, columns, len(text) + 1),
-            )
-        row = [*map(number, cells)]
-        values.extend(row)
-        for column in (k for k, one in enumerate(row) if math.isnan(one) and bare(cells[k]) not in NO_READING):
-            read_number(cells[column], path, line, place_of_cell(text, shape.delimiter, column), mark)
-    if not values:
-        raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
-    return tuple(np.array(values).reshape(-1, columns).T.copy())
