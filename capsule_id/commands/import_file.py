@@ -32,9 +32,9 @@ def run(args: argparse.Namespace) -> int:
             "name the other file and the common signal",
             args.file,
         )
-    if args.clock_of is not None:
-        files = {path: read_file(path) for path in (args.clock_of, args.file)}
-        say(clock_line(files, args.common, default_registry()))
-        return 0
-    say("\n".join(import_report(read_file(args.file), args.file, default_registry())))
+    kinds, content = default_registry(), read_file(args.file)
+    if args.clock_of is None:
+        say("\n".join(import_report(content, args.file, kinds)))
+    else:
+        say(clock_line({args.clock_of: read_file(args.clock_of), args.file: content}, args.common, kinds))
     return 0

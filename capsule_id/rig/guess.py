@@ -279,29 +279,23 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
         export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
-    stamps = {index: values for index in unread if (values := _stamps(content, export, layout, index)) is not None}
+    numbers = tuple(index + 1 for index in unread)
+    again = EXPORTS[suffix](content, path, replace(layout, columns=numbers, words=numbers)) if numbers else export
+    texts = {index: again.words(index).tolist() for index in unread} if again.words else {}
+    stamps = {index: values for index in texts if (values := _stamps(texts[index], export, layout, index)) is not None}
     read_too = {index: error for index, error in unread.items() if index not in stamps}
-    rate, labels = _rate(beginning, names, singles), dict[int, tuple[str, ...]]()
-    for index in (i for i in unread if any(fits_name(names[i], word) > 0 for word in LABELS)):
-        labels[index] = tuple(sorted({*_texts(content, export, layout, index)}))
-    every = {**columns, **stamps}
+    rate, every = _rate(beginning, names, singles), {**columns, **stamps}
+    labelled = [index for index in texts if any(fits_name(names[index], word) > 0 for word in LABELS)]
+    labels = {index: tuple(sorted({*texts[index]})) for index in labelled}
     return FoundLayout(export, layout, names, units, every, read_too, rate, frozenset(stamps), blocks, labels)
 
 
-def _stamps(content: bytes, export: Export, layout: Layout, index: int) -> np.ndarray | None:
+def _stamps(texts: list[str], export: Export, layout: Layout, index: int) -> np.ndarray | None:
     """A column of time stamps that increase, (n,) s since the first one; None for another column."""
     with suppress(InputError):
-        texts = _texts(content, export, layout, index)
         values = seconds_of_stamps(texts, layout.missing, lambda row: export.place(row, index))
         return values if np.nanmax(values) > 0.0 and increases(values) else None
     return None
-
-
-def _texts(content: bytes, export: Export, layout: Layout, index: int) -> list[str]:
-    """The texts of a column; [] where the format has none."""
-    layout = replace(layout, columns=(index + 1,), words=(index + 1,))
-    again = EXPORTS[suffix_of(export.path)](content, export.path, layout)
-    return [] if again.words is None else again.words(index).tolist()
 
 
 def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:

@@ -446,8 +446,10 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
             texts = np.concatenate(own).tolist()
             values[name] = seconds_of_stamps(texts, column_map.layout.missing, partial(place, column=names.index(name)))
             continue
-        scaled = [_scaled(part, one, node[name], source) for part, one in zip(parts, own, strict=True)]
-        values[name] = np.concatenate(scaled)
+        if source.minus is not None:
+            own = [one - part.find(node[name]["minus"], source.minus)[0] for part, one in zip(parts, own, strict=True)]
+        with np.errstate(over="ignore"):
+            values[name] = np.concatenate(own) * source.scale + source.offset
     where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
     keep, missing = _kept(node, values, where)
     for name, source in column_map.sources.items():
@@ -593,14 +595,6 @@ def _held(column: np.ndarray, wanted: Wanted) -> str:
         return f"{seen[0]:.15g} to {seen[-1]:.15g}"
     texts = [shown(str(one)) if isinstance(wanted, str) else f"{one:.15g}" for one in seen[: _MOST_VALUES + 1]]
     return " ".join(texts[:_MOST_VALUES]) + " …" * (len(texts) > _MOST_VALUES) or "no number"
-
-
-def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.ndarray:
-    """The values of a column in its stated unit."""
-    if source.minus is not None:
-        values = values - part.find(node["minus"], source.minus)[0]
-    with np.errstate(over="ignore"):
-        return values * source.scale + source.offset
 
 
 def _kept(

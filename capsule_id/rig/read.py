@@ -507,10 +507,7 @@ def _file_nodes(entry: Node) -> list[Node]:
         raise node.error("an experiment has file or files", "both", "remove file", of_key=True)
     files = isinstance(node.value, list) and bool(node.value)
     node.require(files, "be a list of files", 'write files = ["...", "..."]')
-    found = [node[index] for index in range(len(node.value))]
-    for each in found:
-        each.text()
-    return found
+    return [node[index] for index in range(len(node.value))]
 
 
 def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTable:

@@ -43,7 +43,11 @@ TABLE_FAULTS = [
     ),
     ("dynamic_friction.csv", "speed [m/s],distance [mm]\n0.1,‸\n", "a cell must not be empty"),
     ("dynamic_friction.csv", "speed [m/s];distance [mm]\n0,1;12\n0,2;‸1.5\n", "a cell must be a number"),
-    ("dynamic_friction.csv", "speed [m/s],distance [mm],‸\n0.1,1,\n", "every column must have a header"),
+    (
+        "dynamic_friction.csv",
+        "speed [m/s],distance [mm],‸\n0.1,1,\n",
+        "the first line must be headers `name [unit]`, ''",
+    ),
     ("dynamic_friction.csv", "speed [m/s],‸speed [m/s]\n0.1,1\n", "column names must be unique, a second speed"),
     (
         "dynamic_friction.csv",

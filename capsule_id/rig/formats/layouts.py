@@ -2,10 +2,10 @@
 
 import csv
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -374,11 +374,9 @@ def _rows_of_segments(
     width, lines = len(segments[0].names), [*text.lines()]
     table = [""] * len(lines)
     for number in chain.from_iterable(range(segment.first, segment.stop) for segment in segments):
-        line = lines[number] + separator * width
+        cells = (lines[number] + separator * width).split(separator)[:width]
         # A row that begins as a comment does is one of cells.
-        table[number] = separator.join(
-            [f'"{line}' if is_comment(line) else line for line in line.split(separator)[:width]]
-        )
+        table[number] = separator.join(f'"{cell}' if is_comment(cell) else cell for cell in cells)
     file, shape = TextFile("\n".join(table).encode(), text.path), Shape(segments[0].first, separator, width, decimal)
     rows = rows_of(file, shape, range(width), missing)
     assert rows is not None, "any cell is read with a list of markers"
@@ -387,48 +385,35 @@ def _rows_of_segments(
 
 def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segment]]:
     """Separator, cells of the file's header by key, and segments; special blocks between them are skipped."""
-    path, segments = text.path, list[_Segment]()
-    if not any(line.strip().startswith(_END) for line in text.lines()):
-        raise InputError(
-            f"a .lvm file must have a header that ends with {_END}",
-            "none",
-            "rename a file of plain columns to .txt, or export the record again",
-            path,
-            1,
-            1,
-        )
-    stated = next((line for line in text.lines() if line.startswith("Separator")), "")
-    separator = "," if stated.startswith("Separator,") else "\t"
-    head: dict[str, list[str]] | None = None
-    keys, names, state, first, special, number = dict[str, list[str]](), [""], "header", 0, False, 0
-    for number, line in enumerate(chain(text.lines(), ["", ""])):
-        if state == "rows":
-            if line.strip() and not line.startswith(("***", "Channels")):
-                continue
-            if number == first:
-                raise InputError("a segment must have rows", "none", _REMEDY, path, first, 1)
-            segments.append(_Segment(keys, tuple(names), first, number))
-            if names != [*segments[0].names]:
-                raise InputError(
-                    "segments must have the same columns", shown_cell(" ".join(names)), _REMEDY, path, first, 1
-                )
-            keys, state = {}, "header"
-        key, *cells = (cell.strip() for cell in line.split(separator))
-        if state == "names":
-            names = [" ".join(name.split()) for name in (key, *cells)]
-            while names and names[-1] in ("", _COMMENT):
-                names.pop()
-            state, first = "rows", number + 1
-            continue
-        special = (special or key == _SPECIAL) and key != _END_SPECIAL
-        if key == _END and not special:
-            head, keys, state = (keys, {}, state) if head is None else (head, keys, "names")
-        elif not special and key not in ("", _END_SPECIAL):
-            keys[key] = cells
-    if head is None or keys:
-        raise InputError(f"a header must end with {_END}", "the end of the file", _REMEDY, path, number, 1)
-    if not segments:
-        raise InputError("a LabVIEW measurement file must have a segment", "none", _REMEDY, path, number, 1)
-    if len(segments[0].names) < 2:
-        raise InputError("a segment must have channels", "none", _REMEDY, path, segments[0].first, 1)
-    return separator, head, segments
+    lines, special, segments = list[str](), False, list[_Segment]()
+    for line in text.lines():
+        special = (special or line.startswith(_SPECIAL)) and not line.startswith(_END_SPECIAL)
+        lines.append("" if special or line.startswith(_END_SPECIAL) else line)
+    separator = "," if any(line.startswith("Separator,") for line in lines) else "\t"
+
+    def header(first: int, stop: int) -> dict[str, list[str]]:
+        cells = ([cell.strip() for cell in line.split(separator)] for line in lines[first:stop])
+        return {key: others for key, *others in cells if key}
+
+    end, *ends = [k for k, line in enumerate(lines) if line.strip().startswith(_END)] or [0]
+    stop = end + 1
+    for number in ends:
+        names = [" ".join(name.split()) for name in [*lines, ""][number + 1].split(separator)]
+        while names and names[-1] in ("", _COMMENT):
+            names.pop()
+        rows = takewhile(lambda line: line.strip() and not line.startswith(("***", "Channels")), lines[number + 2 :])
+        keys, first = header(stop, number), number + 2
+        segments.append(_Segment(keys, tuple(names), first, stop := first + len([*rows])))
+    header_alone = "rename a file of plain columns to .txt, or export the record again"
+    for holds, rule, value, remedy, number in (
+        (end, f"a .lvm file must have a header that ends with {_END}", "none", header_alone, 1),
+        *((one.stop > one.first, "a segment must have rows", "none", _REMEDY, one.first) for one in segments),
+        *((one.names == segments[0].names, "segments must have the same columns", shown_cell(" ".join(one.names)), _REMEDY,
+           one.first) for one in segments),
+        (not header(stop, len(lines)), f"a header must end with {_END}", "the end of the file", _REMEDY, len(lines)),
+        (segments, "a LabVIEW measurement file must have a segment", "none", _REMEDY, len(lines)),
+        (segments and len(segments[0].names) > 1, "a segment must have channels", "none", _REMEDY, len(lines)),
+    ):  # fmt: skip
+        if not holds:
+            raise InputError(rule, value, remedy, text.path, number, 1)
+    return separator, header(0, end), segments

@@ -237,18 +237,12 @@ def _encoding(raw: bytes, path: Path) -> str:
         fault = error.start
     if marked:
         raise InputError(rule, "damaged UTF-16", "save it as UTF-8", path, *place_of_byte(raw[:fault], codec))
-    wrong = fault if not raw[:fault].isascii() else None
-    if wrong is None and (found := _NOT_WINDOWS.search(raw)):
-        wrong = found.start()
-    if wrong is not None:
-        raise InputError(
-            "the file must be UTF-8 text",
-            f"byte 0x{raw[wrong : wrong + 1].hex()}",
-            "save it as UTF-8",
-            path,
-            *place_of_byte(raw[:wrong], codec),
-        )
-    return WINDOWS
+    found = _NOT_WINDOWS.search(raw)
+    if found is None and raw[:fault].isascii():
+        return WINDOWS
+    wrong = found.start() if found and raw[:fault].isascii() else fault
+    value, place = f"byte 0x{raw[wrong : wrong + 1].hex()}", place_of_byte(raw[:wrong], codec)
+    raise InputError("the file must be UTF-8 text", value, "save it as UTF-8", path, *place)
 
 
 def lines_of(text: bytes) -> list[str]:

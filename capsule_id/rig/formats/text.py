@@ -5,12 +5,10 @@ import json
 import math
 import re
 import sys
-from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import date
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -189,15 +187,15 @@ def seconds_of_stamps(texts: Sequence[str], missing: Sequence[str], place: Calla
         At the first text that is no stamp, or where the dates are none.
     """
     found = [_STAMP.fullmatch(text) for text in texts]
-    wrong = next(
-        (k for k, (text, one) in enumerate(zip(texts, found, strict=True)) if not one and text not in missing), None
-    )
     known = [k for k, one in enumerate(found) if one]
-    if wrong is not None or not known:
-        wrong = wrong or 0
-        remedy = "correct the cell, or state the unit of the numbers, such as s"
-        rule = "a time stamp must be a time of day, such as 12:34:56.789, with or without a date"
-        raise InputError(rule, shown_cell(texts[wrong]), remedy, *place(wrong))
+    wrong = [k for k, one in enumerate(found) if not one and (not known or texts[k] not in missing)]
+    if wrong:
+        raise InputError(
+            "a time stamp must be a time of day, such as 12:34:56.789, with or without a date",
+            shown_cell(texts[wrong[0]]),
+            "correct the cell, or state the unit of the numbers, such as s",
+            *place(wrong[0]),
+        )
     stamps = [one for one in found if one]
     clocks = np.array([_clock(one) for one in stamps])
     days = list[np.ndarray]()
@@ -276,13 +274,15 @@ class Rows:
 
     Attributes
     ----------
-    numbers : of each column that is read: those of every block, or the error at its first cell that is no number
+    numbers : of each column that is read: those of every block
+    faults : of a column, the error at its first cell that is no number
     texts : of each column whose texts are kept
     blocks : 1-based lines of the rows of every block
     """
 
-    numbers: dict[int, list[np.ndarray | InputError]]
+    numbers: dict[int, list[np.ndarray]]
     texts: dict[int, list[str]]
+    faults: dict[int, InputError] = field(default_factory=dict)
     blocks: list[np.ndarray] = field(default_factory=list)
 
     @property
@@ -298,12 +298,9 @@ class Rows:
         InputError
             At the first cell that is neither a number nor a missing marker.
         """
-        parts = [np.empty(0)]
-        for part in self.numbers[index]:
-            if isinstance(part, InputError):
-                raise part
-            parts.append(part)
-        return np.concatenate(parts)
+        if index in self.faults:
+            raise self.faults[index]
+        return np.concatenate([np.empty(0), *self.numbers[index]])
 
     def words(self, index: int) -> np.ndarray:
         """The texts of a column, (rows,), as objects: one long text must not widen all."""
@@ -330,10 +327,10 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     """
     delimiter, decimal, count = shape.delimiter, shape.decimal or ".", text.count(b"\n")
     allowed = f"{_PLAIN}{delimiter or ''}{decimal}\n".encode()
-    if not text.strip() or text.translate(None, allowed):
-        return None
     # Rows with a last cell have all cells, by the number of separators. Cells between spaces are counted by the reader.
-    if delimiter is not None and text.count(delimiter.encode()) != count * (shape.width - 1 + shape.trailing):
+    separators = count * (shape.width - 1 + shape.trailing)
+    parted = delimiter is None or text.count(delimiter.encode()) == separators
+    if not (text.strip() and parted) or text.translate(None, allowed):
         return None
     used = list(range(shape.width)) if delimiter is None else sorted({*columns, shape.width - 1})
     lines = io.StringIO((text.replace(b",", b".") if decimal == "," else text).decode())
@@ -342,11 +339,10 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
         values = np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
     except ValueError:
         return None
-    if values.shape != (count, len(used)) or not np.isfinite(values).all():
-        return None
-    if not values.all() and _TINY.search(text.decode()):
-        return None
-    return values[:, np.searchsorted(used, columns)]
+    whole = values.shape == (count, len(used)) and np.isfinite(values).all()
+    # A number below the smallest float64 would be 0.
+    exact = whole and (values.all() or not _TINY.search(text.decode()))
+    return values[:, np.searchsorted(used, columns)] if exact else None
 
 
 def are_words(missing: Sequence[str]) -> bool:
@@ -405,7 +401,7 @@ def rows_of(
             try:
                 rows.numbers[column].append(read_column(texts, marks[column] or ".", markers, place))
             except InputError as error:
-                rows.numbers[column].append(error)
+                rows.faults.setdefault(column, error)
     return rows
 
 
@@ -435,10 +431,11 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
     cells = texts_of(text, shape.delimiter)
     cells = cells[:-1] if shape.trailing else cells
     if len(cells) != shape.width:
+        first = f"line {shape.first + 1}" if line > shape.first else "the header"
         commas = " (a decimal comma needs semicolons or tabs between the cells)" * (shape.delimiter == ",")
         ends = f"state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if they begin here"
         raise InputError(
-            f"a row must have {counted(shape.width, 'cell')}, as {f'line {shape.first + 1}' if line > shape.first else 'the header'} has",
+            f"a row must have {counted(shape.width, 'cell')}, as {first} has",
             counted(len(cells), "cell"),
             f"correct the row{commas}, or {ends}",
             path,
@@ -530,12 +527,11 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
     units: dict[str, str] = {}
     remedy = f"{_HEAD}, e.g. `time [s]` ([1]: no unit)"
     for cell, column in cells_of(line, delimiter):
-        bare = cell[1:-1].strip() if len(cell) > 1 and cell[0] == cell[-1] == '"' else cell
-        if not bare:
-            raise InputError("every column must have a header", "an empty cell", remedy, path, 1, column)
-        found = _HEADER_CELL.fullmatch(bare)
+        found = _HEADER_CELL.fullmatch(bare(cell).strip())
         if found is None or not found[2].strip():
-            raise InputError("the first line must be headers `name [unit]`", shown_cell(bare), remedy, path, 1, column)
+            raise InputError(
+                "the first line must be headers `name [unit]`", shown_cell(bare(cell)), remedy, path, 1, column
+            )
         if found[1] in units:
             raise InputError(
                 "column names must be unique", f"a second {found[1]}", "remove or rename it", path, 1, column
