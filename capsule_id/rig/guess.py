@@ -27,9 +27,10 @@ from capsule_id.rig.formats.raw import (
     TextFile,
     lines_of,
 )
-from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps, shown_cell
+from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.times import evened
+from capsule_id.rig.toml import shown
 from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si, scale, symbol_named
 
 # headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
@@ -192,6 +193,8 @@ _DIGITS = re.compile(rb"[0-9]+")
 Cells = tuple[str | None, int] | None
 #: Cells of successive rows, their number, and the lines of the first and the last one, counted from 1.
 Run = tuple[Cells, int, int, int]
+#: Columns of readings and of single numbers, and the errors of all others, by index.
+Readings = tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]
 _RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
 
 
@@ -249,20 +252,19 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
     """
     suffix = suffix_of(path)
     if suffix not in EXPORTS:
-        known = " ".join(EXPORTS)
-        raise InputError(f"a file must have a known format ({known})", path.name, "export it as CSV", path)
+        raise InputError(f"a file must have a known format ({' '.join(EXPORTS)})", path.name, "export it as CSV", path)
     text = suffix.removesuffix(COMPRESSED) in TEXTS and not suffix.startswith(".lvm")
     beginning = _beginning(TextFile(content, path)) if text else b""
     blocks: tuple[tuple[int, int], ...] = ()
     layout = Layout(missing=NO_READING, sheet=sheet)
 
-    def read(layout: Layout) -> tuple[Export, tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]]:
+    def read(layout: Layout) -> tuple[Export, Readings]:
         """The export, and what ``_readings`` finds in it: a column of readings at least."""
         export = EXPORTS[suffix](content, path, layout)
         found = _readings(export)
         if not found[0]:
-            nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
-            raise next(iter(found[2].values()), InputError(*nothing, path))
+            nothing = InputError("a file must have a column of numbers", "none", "export the readings as numbers", path)
+            raise next(iter(found[2].values()), nothing)
         return export, found
 
     try:
@@ -378,8 +380,12 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
             if not columns and unread:
                 first = first or unread[min(unread)]
             if columns and len(export.lines) == 1:
-                rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
-                first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
+                few = (
+                    "an export must have two rows of numbers or more",
+                    "one row",
+                    "export all readings into one file",
+                )
+                first = first or InputError(*few, path, int(export.lines[0]))
             if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
                 runs, longest = _runs([beginning], layout) if line is not None else ([], None)
                 if any(run[2] < (line or 0) for run in runs if longest is not None and run[0] == longest):
@@ -389,7 +395,7 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
     raise first
 
 
-def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]:
+def _readings(export: Export) -> Readings:
     """The columns of readings, all of the most frequent length; the columns of one number; errors of all others."""
     columns: dict[int, np.ndarray] = {}
     singles: dict[int, float] = {}
@@ -617,7 +623,7 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
 def lines_of_labels(found: FoundLayout, kind: KindRule) -> Iterable[tuple[str, str]]:
     """Settings that part the rows of a friction table by the texts of a column, and why."""
     for index, texts in found.labels.items() if "direction" in kind.setting_rules else ():
-        source, held = source_of(found, index), " ".join(map(shown_cell, texts))
+        source, held = source_of(found, index), " ".join(map(shown, texts))
         if len(texts) > 1 and fits_name(found.names[index], "surface") > 0:
             key = source if source.startswith('"') else f'"{source}"'
             yield f'where = {{ {key} = "{UNKNOWN}" }}', f"one capsule has one surface in a fit: write one of {held}"

@@ -72,7 +72,7 @@ def test_a_fault_at_the_end_of_a_large_file_is_found() -> None:
     text = "a [m],b [s]\n" + "".join(f"{i},{i / 7}\n" for i in range(100_000))
     table = read_csv(text.encode(), Path("t.csv"))
     np.testing.assert_array_equal(table.columns[1], np.arange(100_000) / 7)
-    with pytest.raises(InputError, match=r"^t\.csv:100002:3: a cell must be a number, 'x', write"):
+    with pytest.raises(InputError, match=r"^t\.csv:100002:3: a cell must be a number, 'x', correct"):
         read_csv((text + "1,x\n").encode(), Path("t.csv"))
 
 

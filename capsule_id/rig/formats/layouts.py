@@ -35,9 +35,9 @@ from capsule_id.rig.formats.text import (
     number_in,
     place_of_cell,
     rows_of,
-    shown_cell,
     texts_of,
 )
+from capsule_id.rig.toml import shown
 
 # any layout: Reads text exports of any layout: titles, headers, rows of units, comments, and any separator.
 #
@@ -71,7 +71,7 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
         if cell.count('"') % 2:  # rows such as "10,2","1,5": the separator would cut quoted numbers in two
             raise InputError(
                 "a cell in quotation marks must not hold the separator of the cells",
-                shown_cell(row.strip()),
+                shown(row.strip()),
                 "export with a decimal point, or with semicolons between the cells",
                 file.path,
                 first + 1,
@@ -104,16 +104,12 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
     """The text down to ``data_to_line``, where that is stated."""
-    file, last = TextFile(content, path, layout.data_to_line), layout.data_to_line or 0
-    if last and last > (number := sum(text.count(b"\n") for _, text in file.blocks())):
-        raise InputError(
-            f"data_to_line must be a line of the file, which has {number}",
-            str(last),
-            "state the line of the last reading",
-            path,
-            max(number, 1),
-            1,
-        )
+    file = TextFile(content, path, layout.data_to_line)
+    for key in ("data_from_line", "data_to_line"):
+        stated = getattr(layout, key) or 0
+        if stated and stated > (number := sum(text.count(b"\n") for _, text in file.blocks())):
+            rule, remedy = f"{key} must be a line of the file, which has {number}", "state the line of that reading"
+            raise InputError(rule, str(stated), remedy, path, max(number, 1), 1)
     return file
 
 
@@ -131,7 +127,7 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
         If there is none, or the first line with a number is no row of readings.
     """
     lines: list[str] = []
-    begun = None
+    begun, row = None, 0
     for i, line in enumerate(file.lines()):
         lines.append(line)
         if i >= MOST_TITLES and layout.data_from_line is None:
@@ -144,27 +140,12 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
             continue
         cells = split_bare(line, delimiter_of(line, layout))
         if begun is None and any(is_number(cell) for cell in cells):
-            begun, cells = i, _mapped(cells, lines, layout)
+            begun, row, cells = i, i, _mapped(cells, lines, layout)
         if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
             if i == begun:
                 return lines
-            raise InputError(
-                "the first line with a number must be a row of readings",
-                shown_cell(lines[begun].strip()),
-                f"state data_from_line = {i + 1}, or the line of the first reading",
-                file.path,
-                begun + 1,
-                1,
-            )
-    if layout.data_from_line is not None and layout.data_from_line > len(lines):
-        raise InputError(
-            f"data_from_line must be a line of the file, which has {len(lines)}",
-            str(layout.data_from_line),
-            "state the line of the first reading",
-            file.path,
-            max(len(lines), 1),
-            1,
-        )
+            row = i
+            break
     if begun is None:
         raise InputError(
             f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
@@ -175,9 +156,9 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
             1,
         )
     raise InputError(
-        "data_from_line must be stated where no row has numbers only",
-        shown_cell(lines[begun].strip()),
-        f"state data_from_line = {begun + 1}, or the line of the first reading",
+        "the first line with a number must be a row of readings, or data_from_line stated",
+        shown(lines[begun].strip()),
+        f"state data_from_line = {row + 1}, or the line of the first reading",
         file.path,
         begun + 1,
         1,
@@ -253,7 +234,7 @@ def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, l
         return
     raise InputError(
         "a comma between digits must be stated as a separator or a decimal mark",
-        shown_cell(file.line(first).strip()),
+        shown(file.line(first).strip()),
         'state decimal = "," for one column of numbers, decimal = "." for two',
         file.path,
         first + 1,
@@ -281,7 +262,7 @@ def _is_reading(cell: str, layout: Layout) -> bool:
 _END = "***End_of_Header***"
 _SPECIAL, _END_SPECIAL = "***Start_Special***", "***End_Special***"
 _TIMES, _COMMENT = "X_Value", "Comment"
-_REMEDY = "export the record again"
+_REMEDY = "rename a file of plain columns to .txt, or export the record again"
 
 
 @dataclass(frozen=True)
@@ -358,7 +339,7 @@ def _clock(segment: _Segment, channel: int, decimal: str | None, path: Path) -> 
     if start is None or step is None or not np.isfinite([start, step]).all() or step <= 0.0:
         raise InputError(
             "a file without times must state X0 and a positive Delta_X for every channel",
-            shown_cell(" ".join(cells)),
+            shown(" ".join(cells)),
             _REMEDY,
             path,
             segment.first + 1,
@@ -398,22 +379,20 @@ def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segmen
     end, *ends = [k for k, line in enumerate(lines) if line.strip().startswith(_END)] or [0]
     stop = end + 1
     for number in ends:
-        names = [" ".join(name.split()) for name in [*lines, ""][number + 1].split(separator)]
-        while names and names[-1] in ("", _COMMENT):
-            names.pop()
+        found = [" ".join(name.split()) for name in [*lines, ""][number + 1].split(separator)]
+        while found and found[-1] in ("", _COMMENT):
+            found.pop()
         rows = takewhile(lambda line: line.strip() and not line.startswith(("***", "Channels")), lines[number + 2 :])
         keys, first = header(stop, number), number + 2
-        segments.append(_Segment(keys, tuple(names), first, stop := first + len([*rows])))
-    header_alone = "rename a file of plain columns to .txt, or export the record again"
-    for holds, rule, value, remedy, number in (
-        (end, f"a .lvm file must have a header that ends with {_END}", "none", header_alone, 1),
-        *((one.stop > one.first, "a segment must have rows", "none", _REMEDY, one.first) for one in segments),
-        *((one.names == segments[0].names, "segments must have the same columns", shown_cell(" ".join(one.names)), _REMEDY,
-           one.first) for one in segments),
-        (not header(stop, len(lines)), f"a header must end with {_END}", "the end of the file", _REMEDY, len(lines)),
-        (segments, "a LabVIEW measurement file must have a segment", "none", _REMEDY, len(lines)),
-        (segments and len(segments[0].names) > 1, "a segment must have channels", "none", _REMEDY, len(lines)),
-    ):  # fmt: skip
+        segments.append(_Segment(keys, tuple(found), first, stop := first + len([*rows])))
+    names = {segment.names for segment in segments}
+    for holds, rule, number in (
+        (end, f"a .lvm file must have a header that ends with {_END}", 1),
+        *((one.stop > one.first, "a segment must have rows", one.first) for one in segments),
+        (len(names) < 2, "segments must have the same columns", stop),
+        (not header(stop, len(lines)), f"a header must end with {_END}", stop + 1),
+        (min(map(len, names), default=0) > 1, "a LabVIEW measurement file must have a segment with channels", stop),
+    ):
         if not holds:
-            raise InputError(rule, value, remedy, text.path, number, 1)
+            raise InputError(rule, shown([*lines, ""][number - 1]), _REMEDY, text.path, number, 1)
     return separator, header(0, end), segments

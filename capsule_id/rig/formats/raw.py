@@ -404,9 +404,7 @@ def refuse_line(layout: Layout, path: Path) -> None:
             raise InputError(f"a {path.suffix} file has no {key}", f"{key} = {value}", f"remove {key}", path)
 
 
-def export_of_arrays(
-    arrays: Mapping[str, np.ndarray], path: Path, layout: Layout, units: Mapping[str, str] | None = None
-) -> Export:
+def export_of_arrays(arrays: Mapping[str, np.ndarray], path: Path, layout: Layout, units: Mapping[str, str]) -> Export:
     """The columns of named arrays: every vector, and every column of a matrix, ``data(:,2)`` for the second.
 
     A matrix far wider than high holds its channels in rows: ``data(2,:)`` for the second.
@@ -436,7 +434,7 @@ def export_of_arrays(
                 form = "({},:)" if rows else "(:,{})"
                 own = {name + form.format(i + 1): one for i, one in enumerate(array if rows else array.T)}
             columns |= own
-            stated += [(units or {}).get(name, "")] * len(own)
+            stated += [units.get(name, "")] * len(own)
     refuse_wide(len(columns) or widest, path)
     if not columns:
         raise InputError(

@@ -15,6 +15,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import NO_READING, Place, RawTable, TextFile, lines_of, refuse_wide
+from capsule_id.rig.toml import shown
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -37,7 +38,6 @@ _APART = {
 # Only with such an exponent may a number be below the smallest float64: its cells are then read one by one.
 _TINY = re.compile("[eE]-0*(?:[1-9][0-9]{3}|[3-9][0-9]{2})")
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
-_LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
 
 def cells_of(line: str, delimiter: str | None) -> list[tuple[str, int]]:
@@ -89,15 +89,14 @@ def no_number(cell: str, value: float | None, place: Place) -> InputError:
     """The error about a cell that is no number (None), or whose ``value`` float64 does not hold."""
     infinite = cell.lower().lstrip("+-") in ("inf", "infinity")
     missing = f"or add {json.dumps(cell, ensure_ascii=False)} to missing = [...] to drop its row"
-    plain = "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file"
     causes = (
         (value == 0.0, "number that float64 holds", "write 0: float64 begins at 5e-324"),
         (value is not None, "finite number", "write a smaller number: float64 ends at 1.8e308"),
         (infinite, "finite number", "delete the row"),
-        (True, "number", f"{plain}, {missing}"),
+        (True, "number", f"correct the cell, {missing}"),
     )
     rule, remedy = next((rule, remedy) for holds, rule, remedy in causes if holds)
-    return InputError(f"a cell must be a {rule}", shown_cell(cell), remedy, *place)
+    return InputError(f"a cell must be a {rule}", shown(cell), remedy, *place)
 
 
 def is_beyond_floats(value: float, written: str) -> bool:
@@ -155,12 +154,6 @@ def read_column(
     return values
 
 
-def shown_cell(cell: str) -> str:
-    """A faulty cell for an error line: printable and short."""
-    text = repr(cell)
-    return text if len(text) <= _LONGEST_QUOTED else text[:_LONGEST_QUOTED] + "…"
-
-
 # stamps: Dates and times of day as seconds since the first one.
 
 
@@ -192,7 +185,7 @@ def seconds_of_stamps(texts: Sequence[str], missing: Sequence[str], place: Calla
     if wrong:
         raise InputError(
             "a time stamp must be a time of day, such as 12:34:56.789, with or without a date",
-            shown_cell(texts[wrong[0]]),
+            shown(texts[wrong[0]]),
             "correct the cell, or state the unit of the numbers, such as s",
             *place(wrong[0]),
         )
@@ -203,9 +196,7 @@ def seconds_of_stamps(texts: Sequence[str], missing: Sequence[str], place: Calla
         with suppress(ValueError):
             days.append(np.array([_day(one, first) for one in stamps]))
     if not days:
-        raise InputError(
-            "the date of a time stamp must exist", shown_cell(texts[known[0]]), "correct it", *place(known[0])
-        )
+        raise InputError("the date of a time stamp must exist", shown(texts[known[0]]), "correct it", *place(known[0]))
     turn = 24 * _HOUR if stamps[0]["tail"] is None else _HOUR
     day = min(days, key=np.ptp)  # 03/04/2024: the order of day and month that makes the record shorter
     if not day.any():
@@ -373,7 +364,8 @@ def rows_of(
         # No other decimal mark than that of the reader in C can be meant.
         plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
         values = plain_block(block, shape, columns) if plain else None
-        kept = [*_rows_in(number, block)] if values is None else []
+        every = enumerate(lines_of(block) if values is None else (), number)
+        kept = [(line, row) for line, row in every if is_row(row)]
         if values is None and plain and len(kept) < block.count(b"\n"):  # blank lines or comments
             values = plain_block("\n".join([*(text for _, text in kept), ""]).encode(), shape, columns)
         if values is None and kept and missing is None:
@@ -419,11 +411,6 @@ def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str]) -> dict[int
                 lone[k] = whole
     shown = {mark for k, mark in marks.items() if k not in lone}
     return {k: marks[k] for k, whole in lone.items() if whole or shown == {*",."} - {marks[k]}}
-
-
-def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:
-    """The rows of a block with their 0-based lines; ``number`` is that of the first line."""
-    return ((line, row) for line, row in enumerate(lines_of(text), number) if is_row(row))
 
 
 def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
@@ -495,8 +482,12 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     missing = np.any(np.isnan(raw.columns), axis=0)
     if missing.all():  # the first cell of the first row that holds none
         here = raw.place(0, int(np.argmax([np.isnan(column[0]) for column in raw.columns])))
-        remedy = "write a number; a table must have a row without missing cells"
-        raise InputError("a cell must not be empty", "nothing", remedy, *here)
+        raise InputError(
+            "a cell must not be empty",
+            "nothing",
+            "write a number; a table must have a row without missing cells",
+            *here,
+        )
     lost = np.sort(np.append(lines[missing], empty).astype(int))
     return replace(raw.taken(np.flatnonzero(~missing)), lost=lost) if len(lost) else raw
 
@@ -516,7 +507,7 @@ def _lines_without_cells(file: TextFile, rows: np.ndarray) -> list[int]:
     known = {*rows.tolist()}
     others = [(number, text.strip()) for number, text in enumerate(file.lines(1), 2) if number not in known]
     for number, text in others:
-        comment = ("a row must be numbers", shown_cell(text), "remove comments from the table")
+        comment = ("a row must be numbers", shown(text), "remove comments from the table")
         if is_comment(text) or (not text and number < rows[-1]):
             raise InputError(*(comment if text else _BLANK), file.path, number, 1)
     return [number for number, text in others if text]
@@ -529,9 +520,7 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
     for cell, column in cells_of(line, delimiter):
         found = _HEADER_CELL.fullmatch(bare(cell).strip())
         if found is None or not found[2].strip():
-            raise InputError(
-                "the first line must be headers `name [unit]`", shown_cell(bare(cell)), remedy, path, 1, column
-            )
+            raise InputError("the first line must be headers `name [unit]`", shown(bare(cell)), remedy, path, 1, column)
         if found[1] in units:
             raise InputError(
                 "column names must be unique", f"a second {found[1]}", "remove or rename it", path, 1, column

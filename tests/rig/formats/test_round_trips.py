@@ -97,7 +97,7 @@ def test_channels_of_a_labview_file_with_different_rates_have_times_of_their_own
         (
             "***End_of_Header***",
             "***End***",
-            "must have a header that ends with .*, none, rename a file of plain columns",
+            "must have a header that ends with .*, rename a file of plain columns",
         ),
     ],
 )
