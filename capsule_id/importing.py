@@ -575,13 +575,6 @@ def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kin
     InputError
         If a file has no times or no such header, or the signals are not the same.
     """
-    if len(files) < 2:
-        raise InputError(
-            "--clock-of must name another file",
-            "the same file twice",
-            "name the file of the other logger",
-            next(iter(files)),
-        )
     records = []
     for path, content in files.items():
         found = find_layout(content, path, dimensions_of(kinds))

@@ -25,11 +25,11 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If the file cannot be read.
     """
-    if (args.clock_of is None) != (args.common is None):
+    if (args.clock_of is None) != (args.common is None) or args.clock_of == args.file:
         raise InputError(
-            "--clock-of and --common must stand together",
-            "one of them",
-            "name the other file and the common signal",
+            "--clock-of and --common must stand together, and name another file",
+            "one of them, or the same file",
+            "name the file of the other logger and the common signal",
             args.file,
         )
     kinds, content = default_registry(), read_file(args.file)

@@ -91,7 +91,8 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
     rows = rows_of(file, shape, wanted, None, words) if are_words(layout.missing) else None
-    rows = rows or rows_of(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
+    stated = decimal is not None and layout.decimal == decimal
+    rows = rows or rows_of(file, replace(shape, decimal=decimal, stated=stated), wanted, layout.missing, words)
     assert rows is not None, "any cell is read with a list of markers"
     lines = rows.lines
 

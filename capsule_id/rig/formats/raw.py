@@ -148,7 +148,8 @@ class TextFile:
             else raw.decode(_CODECS[self.encoding]).encode()
         )
         text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
-        self._text = _with_points(text.replace(b" -> ", b"\t"))  # behind the time stamps of a serial monitor
+        # A serial monitor writes an arrow behind the time stamp of each line.
+        self._text = _with_points(re.sub(rb"(?m)^([0-9:.,]+) -> ", rb"\1\t", text) if b" -> " in text else text)
         if last is not None:
             ends = np.append(np.flatnonzero(np.frombuffer(self._text, np.uint8) == ord("\n")), len(self._text))
             self._text = self._text[: ends[min(last, len(ends)) - 1] + 1]

@@ -249,6 +249,7 @@ class Shape:
     delimiter : separator; None: any number of spaces and tabs
     width : cells of a row
     decimal : decimal mark; None: that of each column
+    stated : ``rig.toml`` states the decimal mark: the other one separates thousands
     trailing : every row ends with a separator and a blank cell, which is not counted
     """
 
@@ -257,6 +258,7 @@ class Shape:
     width: int
     decimal: str | None
     trailing: bool = False
+    stated: bool = False
 
 
 @dataclass(frozen=True)
@@ -378,10 +380,11 @@ def rows_of(
             continue
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         turned = [*zip(*cells, strict=True)] or [()] * shape.width
-        apart = (_apart(turned, markers) if shape.decimal is None else {}) if apart is None else apart
+        if apart is None:
+            apart = _apart(turned, markers, shape.decimal) if shape.decimal is None or shape.stated else {}
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
-            texts = [text.replace(apart[column], "") for text in texts] if column in apart else texts
+            texts = [text.replace(mark, "") for text in texts] if (mark := apart.get(column, "")) else texts
             if column in words:
                 rows.texts[column] += map(sys.intern, texts)
             marks[column] = marks[column] or decimal_mark(texts, markers)
@@ -391,26 +394,41 @@ def rows_of(
                 return file.path, line + 1, place_of_cell(text, shape.delimiter, column)
 
             try:
+                if mark is None:
+                    raise _ambiguous(texts, place)
                 rows.numbers[column].append(read_column(texts, marks[column] or ".", markers, place))
             except InputError as error:
                 rows.faults.setdefault(column, error)
     return rows
 
 
-def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str]) -> dict[int, str]:
+def _ambiguous(texts: Sequence[str], place: Callable[[int], Place]) -> InputError:
+    """The error about the first of these numbers, with a mark before its last three digits."""
+    k = next(k for k, text in enumerate(texts) if text[-4:-3] in (".", ","))
+    other = "," if texts[k][-4] == "." else "."
+    rule = f"whether 1{texts[k][-4:]} is a thousand must be stated where a column has {other!r} for decimal mark"
+    remedy = f'state decimal = "{other}" if it is, or write its numbers with that decimal mark'
+    return InputError(rule, shown(texts[k]), remedy, *place(k))
+
+
+def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str], decimal: str | None) -> dict[int, str | None]:
     """The point or the comma between thousands, by column, where all cells with it may be such numbers: 1,234 and 998.
 
-    Other columns show the other mark, or many cells with it stand beside whole numbers of three digits at most.
+    The other mark is the stated ``decimal`` one, or many cells stand beside whole numbers of three digits at most. None:
+    another column alone shows the other mark.
     """
     marks, lone = dict[int, str](), dict[int, bool]()
     for k, texts in enumerate(columns):
-        if (mark := decimal_mark(texts := [bare(text) for text in texts], missing)) is not None:
-            marked, marks[k] = [text for text in texts if mark in text], mark
+        mark = decimal_mark(texts := [bare(text) for text in texts], missing)
+        marked = [text for text in texts if mark and mark in text]
+        if mark and number_in(marked[0], mark) is not None:  # a date shows no decimal mark
+            marks[k] = mark
             whole = len(marked) >= FEWEST_APART and any(_SHORT.fullmatch(text) for text in texts)
             if all((found := _GROUPED.fullmatch(text)) and text[-4] == found["mark"] for text in marked):
-                lone[k] = whole
-    shown = {mark for k, mark in marks.items() if k not in lone}
-    return {k: marks[k] for k, whole in lone.items() if whole or shown == {*",."} - {marks[k]}}
+                lone[k] = whole if decimal is None else mark != decimal
+    # A stated mark leaves nothing open.
+    others = {mark for k, mark in marks.items() if k not in lone} if decimal is None else set[str]()
+    return {k: marks[k] if sure else None for k, sure in lone.items() if sure or others == {*",."} - {marks[k]}}
 
 
 def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
