@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capsule_id.errors import InputError, printable
+from capsule_id.errors import InputError, printable, refusing
 from capsule_id.experiments.kind import Kind, default_registry
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples
@@ -302,17 +302,11 @@ def read_file(path: Path) -> bytes:
     InputError
         If it cannot be read.
     """
-    try:
+    with refusing("FILE must be readable", "check its permissions", path):
         if not path.is_file():
-            raise InputError(
-                "FILE must be a regular file",
-                "a directory" if path.is_dir() else "no such file",
-                "correct the name",
-                path,
-            )
+            found = "a directory" if path.is_dir() else "no such file"
+            raise InputError("FILE must be a regular file", found, "correct the name", path)
         return path.read_bytes()
-    except OSError as error:
-        raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None
 
 
 def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
@@ -353,14 +347,15 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
         headers = ", ".join(name for name in found.names if name) or "none"
         heads = {index: found.header(index, ["s"]) for index in found.columns}
         times = [index for index, (name, text) in heads.items() if fits_name(name, TIME) > 0 and unit_of(text, ["s"])]
-        falls = [(i, row + 1) for i in times for row in np.flatnonzero(np.diff(found.columns[i]) <= 0.0)[:1]]
+        falls = [
+            f"#: Times must increase; {found.names[index]!r} does not at line {found.export.lines[row + 1]}. "
+            "Export times with more digits, or correct the headers."
+            for index in times
+            for row in np.flatnonzero(np.diff(found.columns[index]) <= 0.0)[:1]
+        ]
         lines = [
             f"#: {file}: unsure. No kind fits its headers: {headers}.",
-            *(
-                f"#: Times must increase; {found.names[index]!r} does not at line {found.export.lines[row]}. "
-                "Export times with more digits, or correct the headers."
-                for index, row in falls[:1]
-            ),
+            *falls[:1],
             *unread,
             f"#: Write one of {' '.join(kinds)}, and the columns of that kind.",
             "# [[experiment]]",

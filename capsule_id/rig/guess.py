@@ -5,7 +5,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise, product, takewhile
 from pathlib import Path
 from typing import Literal
@@ -223,9 +223,9 @@ class FoundLayout:
     columns: dict[int, np.ndarray]
     unread: dict[int, InputError]
     rate: float | None
-    stamps: frozenset[int] = frozenset()
-    blocks: tuple[tuple[int, int], ...] = ()
-    labels: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    stamps: frozenset[int]
+    blocks: tuple[tuple[int, int], ...]
+    labels: Mapping[int, tuple[str, ...]]
 
     def header(self, index: int, dimensions: Sequence[str]) -> tuple[str, str]:
         """Name of a column, and the text of its unit: that of its header, else that of the row of units, or ""."""

@@ -346,13 +346,10 @@ def _source(node: Node, rule: ColumnRule) -> Source:
 def _header(node: Node) -> Header:
     """A header, or a number counted from 1."""
     key, value = node.key, node.value
-    if isinstance(value, int) and not isinstance(value, bool):
-        if value < 1:
-            raise node.error("columns are counted from 1", str(value), "write 1 for the first column")
+    if is_count(value):
         return value
-    node.require(
-        isinstance(value, str), "be a header or the number of a column", f'write {key} = 1 or {key} = "<header>"'
-    )
+    rule = "be a header or the number of a column, counted from 1"
+    node.require(isinstance(value, str), rule, f'write {key} = 1 or {key} = "<header>"')
     named = f"name the column that holds {node.path[-2]}"
     node.require(value != UNKNOWN, named, "write its header, or its number counted from 1")
     return " ".join(node.text().split())
@@ -449,13 +446,8 @@ def _by_texts(split_by: Node, parts: Sequence["_Part"], raw: RawTable, keep: np.
     texts = np.concatenate([part.find(split_by, header, texts=True)[0] for part in parts])[keep]
     names, owners = np.unique(texts, return_inverse=True)
     if "" in names:
-        raise raw.error(
-            int(np.argmin(owners)),
-            raw.names[0],
-            f"split_by needs a text in every row of {split_by.value}",
-            "none",
-            "fill it",
-        )
+        rule = f"split_by needs a text in every row of {split_by.value}"
+        raise raw.error(int(np.argmin(owners)), raw.names[0], rule, "none", "fill it")
     return [*zip(map(str, names), raw.divided(owners), strict=True)]
 
 

@@ -413,12 +413,9 @@ def _parted(
     for end, (name, raw) in zip(ends, parts, strict=True):
         directed = bool(name) and "direction" in vars(settings)
         if directed and fits_name(split := entry["split_by"].text(), "surface") > 0:
-            raise entry["split_by"].error(
-                "one fit has one surface: the rows of one alone may be used",
-                split,
-                f'write where = {{ "{split}" = "{name}" }} in place of split_by',
-                of_key=True,
-            )
+            rule = "one fit has one surface: the rows of one alone may be used"
+            remedy = f'write where = {{ "{split}" = "{name}" }} in place of split_by'
+            raise entry["split_by"].error(rule, split, remedy, of_key=True)
         backward = directed and fits_name(name, "backward") > 0
         here = replace(settings, **{"direction": "backward"}) if backward else settings
         yield f"{label}_{end}" if name else label, here, raw

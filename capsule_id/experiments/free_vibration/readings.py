@@ -476,26 +476,16 @@ def divide_at_releases(entry: Node, columns: Mapping[str, np.ndarray], settings:
         return None
     for key in ("start", "stop", "samples"):
         if key in entry:
-            raise entry[key].error(
-                f"releases finds each decay of a record by itself, and takes no {key}",
-                "both",
-                f"remove {key}, or releases",
-                of_key=True,
-            )
+            rule = f"releases finds each decay of a record by itself, and takes no {key}"
+            raise entry[key].error(rule, "both", f"remove {key}, or releases", of_key=True)
     found = find_releases(columns["time"], columns[channel], channel == "x_rel")
     if not found:
-        raise entry["releases"].error(
-            "releases needs a record of several releases",
-            "fewer than two found",
-            "remove releases: one decay is found without it",
-        )
+        rule, remedy = "releases needs a record of several releases", "remove releases: one decay is found without it"
+        raise entry["releases"].error(rule, "fewer than two found", remedy)
     chosen = [k + 1 for k in range(len(found))] if isinstance(wanted, str) else wanted
     if max(chosen) > len(found) or len(set(chosen)) < len(chosen):
-        raise entry["releases"].error(
-            f"releases must name some of the {len(found)} releases found, each once",
-            shown(wanted),
-            'correct the numbers, or write "all"',
-        )
+        rule = f"releases must name some of the {len(found)} releases found, each once"
+        raise entry["releases"].error(rule, shown(wanted), 'correct the numbers, or write "all"')
     owners = np.full(len(columns["time"]), -1)
     for k, number in enumerate(sorted(chosen)):
         owners[found[number - 1]] = k

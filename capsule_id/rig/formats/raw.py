@@ -264,14 +264,8 @@ def place_of_byte(before: bytes, codec: str = "utf-8") -> tuple[int, int]:
 NO_READING = tuple(
     dict.fromkeys(
         text
-        for word in ("", "-", "--", "---", "NaN", "NA", "N/A", "#N/A", "null", "none")
-        for text in (
-            word,
-            word.lower(),
-            word.upper(),
-            word.capitalize(),
-            *([f"-{word}", f"-{word.lower()}"] * (word == "NaN")),
-        )
+        for word in ("", "-", "--", "---", "NaN", "-NaN", "NA", "N/A", "#N/A", "null", "none")
+        for text in (word, word.lower(), word.upper(), word.capitalize())
     )
 )
 

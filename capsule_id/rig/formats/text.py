@@ -91,8 +91,7 @@ def no_number(cell: str, value: float | None, place: Place) -> InputError:
     missing = f"or add {json.dumps(cell, ensure_ascii=False)} to missing = [...] to drop its row"
     causes = (
         (value == 0.0, "number that float64 holds", "write 0: float64 begins at 5e-324"),
-        (value is not None, "finite number", "write a smaller number: float64 ends at 1.8e308"),
-        (infinite, "finite number", "delete the row"),
+        (infinite or value is not None, "finite number", "delete the row, or write less than 1.8e308"),
         (True, "number", f"correct the cell, {missing}"),
     )
     rule, remedy = next((rule, remedy) for holds, rule, remedy in causes if holds)
@@ -437,7 +436,7 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
     cells = cells[:-1] if shape.trailing else cells
     if len(cells) != shape.width:
         first = f"line {shape.first + 1}" if line > shape.first else "the header"
-        commas = " (a decimal comma needs semicolons or tabs between the cells)" * (shape.delimiter == ",")
+        commas = " (decimal commas need semicolons or tabs between the cells)" * (shape.delimiter == ",")
         ends = f"state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if they begin here"
         raise InputError(
             f"a row must have {counted(shape.width, 'cell')}, as {first} has",
@@ -488,6 +487,16 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")
     shape = Shape(1, delimiter, len(names), decimal)
+    quoted = [
+        (cell, number + k + 1, column)
+        for number, block in file.blocks(1)
+        if b'"' in block
+        for k, text in enumerate(lines_of(block))
+        for cell, column in cells_of(text, delimiter)
+        if '"' in cell and bare(cell) not in NO_READING and is_row(text)
+    ]
+    for cell, *where in quoted:  # a mark may be left of a damaged cell
+        raise InputError("a cell must be a number", shown(cell), "remove the quotation marks", path, *where)
     rows = rows_of(file, shape, range(len(names)), NO_READING)
     assert rows is not None, "any cell is read with a list of markers"
     lines, empty = rows.lines, _lines_without_cells(file, rows.lines)
@@ -500,12 +509,8 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     missing = np.any(np.isnan(raw.columns), axis=0)
     if missing.all():  # the first cell of the first row that holds none
         here = raw.place(0, int(np.argmax([np.isnan(column[0]) for column in raw.columns])))
-        raise InputError(
-            "a cell must not be empty",
-            "nothing",
-            "write a number; a table must have a row without missing cells",
-            *here,
-        )
+        remedy = "write a number; a table must have a row without missing cells"
+        raise InputError("a cell must not be empty", "nothing", remedy, *here)
     lost = np.sort(np.append(lines[missing], empty).astype(int))
     return replace(raw.taken(np.flatnonzero(~missing)), lost=lost) if len(lost) else raw
 
