@@ -91,7 +91,7 @@ def no_number(cell: str, value: float | None, place: Place) -> InputError:
     missing = f"or add {json.dumps(cell, ensure_ascii=False)} to missing = [...] to drop its row"
     causes = (
         (value == 0.0, "number that float64 holds", "write 0: float64 begins at 5e-324"),
-        (infinite or value is not None, "finite number", "delete the row, or write less than 1.8e308"),
+        (infinite or value is not None, "finite number", "write a smaller number: float64 ends at 1.8e308"),
         (True, "number", f"correct the cell, {missing}"),
     )
     rule, remedy = next((rule, remedy) for holds, rule, remedy in causes if holds)
