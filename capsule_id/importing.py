@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, printable, refusing
 from capsule_id.experiments.kind import Kind, default_registry
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples
@@ -170,11 +170,11 @@ def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess]
     for index in found.columns:
         stem, text = found.header(index, [*ANGULAR, *ANGULAR.values()])
         unit = unit_of(text, [ANGULAR[si]])
-        known = max(fits_name(stem, name), fits_name(stem, "angle") if name == "x_rel" else 0) > 0
-        if known and unit is not None:
+        angle = name == "x_rel" and fits_name(stem, "angle") > 0
+        if unit is not None and (angle or fits_name(stem, name) > 0):
             reason = f"{found.names[index]!r} times an arm of 1 m; {remedy}"
             return name, ColumnGuess(index, si, "unsure", reason, factor_to_si(unit, ANGULAR[si]))
-        if name == "x_rel" and not text and fits_name(stem, "angle") > 0:
+        if angle and not text:
             reason = f"an angle without unit: write {si} and scale = 1 for rad, 0.01745329252 for degrees"
             return name, ColumnGuess(index, UNKNOWN, "unsure", f"{reason}; {remedy}")
     return None
@@ -302,17 +302,11 @@ def read_file(path: Path) -> bytes:
     InputError
         If it cannot be read.
     """
-    try:
+    with refusing("FILE must be readable", "check its permissions", path):
         if not path.is_file():
-            raise InputError(
-                "FILE must be a regular file",
-                "a directory" if path.is_dir() else "no such file",
-                "correct the name",
-                path,
-            )
+            found = "a directory" if path.is_dir() else "no such file"
+            raise InputError("FILE must be a regular file", found, "correct the name", path)
         return path.read_bytes()
-    except OSError as error:
-        raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None
 
 
 def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
@@ -350,20 +344,20 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
     """The lines of ``[[experiment]]`` for an export with its guess."""
     unread, file = list(_unread_lines(found, dimensions_of(kinds))), found.export.path.name
     if guessed is None:
-        words = " ".join(kinds)
         headers = ", ".join(name for name in found.names if name) or "none"
-        named = [(index, *found.header(index, ["s"])) for index in found.columns]
-        times = [index for index, name, text in named if fits_name(name, TIME) > 0 and unit_of(text, ["s"]) is not None]
-        falls = [(i, row + 1) for i in times for row in np.flatnonzero(np.diff(found.columns[i]) <= 0.0)[:1]]
+        heads = {index: found.header(index, ["s"]) for index in found.columns}
+        times = [index for index, (name, text) in heads.items() if fits_name(name, TIME) > 0 and unit_of(text, ["s"])]
+        falls = [
+            f"#: Times must increase; {found.names[index]!r} does not at line {found.export.lines[row + 1]}. "
+            "Export times with more digits, or correct the headers."
+            for index in times
+            for row in np.flatnonzero(np.diff(found.columns[index]) <= 0.0)[:1]
+        ]
         lines = [
             f"#: {file}: unsure. No kind fits its headers: {headers}.",
-            *(
-                f"#: Times must increase; {found.names[index]!r} does not at line {found.export.lines[row]}. "
-                "Export times with more digits, or correct the headers."
-                for index, row in falls[:1]
-            ),
+            *falls[:1],
             *unread,
-            f"#: Write one of {words}, and the columns of that kind.",
+            f"#: Write one of {' '.join(kinds)}, and the columns of that kind.",
             "# [[experiment]]",
             '# kind = "..."',
             f"# file = {json.dumps(file)}",
@@ -390,10 +384,10 @@ def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str
         name, text = found.header(index, dimensions)
         if fits_name(name, TIME) <= 0 and (not text or unit_of(text, dimensions) is None):
             continue
-        remedy = "Correct the cell or delete the row, or list its text in missing."
-        if ":" in error.value and fits_name(name, TIME) > 0:
-            remedy = "Export times as seconds, or state the sampling rate."
-        yield f"#: {found.names[index]!r} is not read: line {error.line} has {' '.join(error.value.split())}. {remedy}"
+        stamps = ":" in error.value and fits_name(name, TIME) > 0
+        remedy = printable("export times as seconds, or state the sampling rate" if stamps else error.remedy)
+        value = f"line {error.line} has {' '.join(error.value.split())}"
+        yield f"#: {found.names[index]!r} is not read: {value}. {remedy[0].upper()}{remedy[1:]}."
 
 
 def _unused_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
@@ -418,8 +412,7 @@ def _commented(line: str, confidence: str, reason: str) -> str:
 
 def _description(found: FoundLayout, content: bytes) -> str:
     """Rows and separator of a file in words."""
-    rows = len(found.export.lines)
-    text = counted(rows, "row")
+    text = counted(len(found.export.lines), "row")
     if found.export.path.suffix.lower() not in (".csv", ".txt", ".tsv", ".dat"):
         return text
     line = TextFile(content, found.export.path).line(int(found.export.lines[0]) - 1)
@@ -445,9 +438,7 @@ def _layout_lines(found: FoundLayout) -> Iterable[str]:
 def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
     """Settings that the record or the name of the file suggests."""
     for key in kind.required:
-        stem = "".join(
-            mark if mark.isalnum() or mark in "._-" else "_" for mark in found.export.path.name.split(".")[0]
-        )
+        stem = re.sub(r"[^A-Za-z0-9._-]", "_", found.export.path.name.split(".")[0])
         yield _commented(f'{key} = "{stem}"', "unsure", "from the name of the file")
     constant = _constant_settings(found, guessed, kind)
     yield from constant.values()
@@ -579,13 +570,6 @@ def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kin
     InputError
         If a file has no times or no such header, or the signals are not the same.
     """
-    if len(files) < 2:
-        raise InputError(
-            "--clock-of must name another file",
-            "the same file twice",
-            "name the file of the other logger",
-            next(iter(files)),
-        )
     records = []
     for path, content in files.items():
         found = find_layout(content, path, dimensions_of(kinds))
@@ -634,11 +618,10 @@ def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record
     line = f"column {index + 1} {name or 'without name'} [{unit}]: {values.min():.6g} to {values.max():.6g}"
     line += f", reading step {step:.3g}" if step else ""
     line += f", {missing} missing" if missing else ""
-    faults = []
     if record and len(values) > 2 and np.ptp(values) > 0.0:
         for clipped in clipped_samples(values, np.inf):
-            faults.append(f"{counted(len(clipped.rows), 'sample')} clipped at {clipped.level:g}")
+            line += f"; {counted(len(clipped.rows), 'sample')} clipped at {clipped.level:g}"
         for what, rows in (("drop-out", dropouts(values)), ("frozen sample", frozen_samples(values))):
             if len(rows):
-                faults.append(f"{counted(len(rows), what)}, the first in line {found.export.lines[rows[0]]}")
-    yield "; ".join([line, *faults])
+                line += f"; {counted(len(rows), what)}, the first in line {found.export.lines[rows[0]]}"
+    yield line

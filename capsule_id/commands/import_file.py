@@ -25,16 +25,16 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If the file cannot be read.
     """
-    if (args.clock_of is None) != (args.common is None):
+    if (args.clock_of is None) != (args.common is None) or args.clock_of == args.file:
         raise InputError(
-            "--clock-of and --common must stand together",
-            "one of them",
-            "name the other file and the common signal",
+            "--clock-of and --common must stand together, and name another file",
+            "one of them, or the same file",
+            "name the file of the other logger and the common signal",
             args.file,
         )
-    if args.clock_of is not None:
-        files = {path: read_file(path) for path in (args.clock_of, args.file)}
-        say(clock_line(files, args.common, default_registry()))
-        return 0
-    say("\n".join(import_report(read_file(args.file), args.file, default_registry())))
+    kinds, content = default_registry(), read_file(args.file)
+    if args.clock_of is None:
+        say("\n".join(import_report(content, args.file, kinds)))
+    else:
+        say(clock_line({args.clock_of: read_file(args.clock_of), args.file: content}, args.common, kinds))
     return 0

@@ -191,19 +191,14 @@ def run(args: argparse.Namespace) -> int:
         contents = {"rig.toml": text.encode(), "rig.schema.json": schema, **contents}
         # A part of a table would be read as a table.
         replace_files({folder / file: text for file, text in contents.items() if (folder / file).resolve() not in own})
-    if not files:
-        say(
-            f"wrote {folder / 'rig.toml'}: add tables, remove the `# ` of their entries, then run capsule-id check {folder}"
-        )
-        return 0
-    lines = [f"wrote {folder / 'rig.toml'}:"]
-    lines += [
-        f"{file}: {'kind unsure' if guessed is None else guessed.kind}{', unsure' if guessed and guessed.unsure else ''}"
-        for file, (_, guessed) in guesses.items()
-    ]
-    say(
-        "\n".join(
-            [*lines, f"check its guesses, {'' if masses else 'state the masses, '}then run capsule-id check {folder}"]
-        )
+    guessed = "".join(
+        f"\n{file}: {'kind unsure' if one is None else one.kind}{', unsure' if one and one.unsure else ''}"
+        for file, (_, one) in guesses.items()
     )
+    ahead = (
+        f"\ncheck its guesses, {'' if masses else 'state the masses, '}"
+        if files
+        else (" add tables, remove the `# ` of their entries, ")
+    )
+    say(f"wrote {folder / 'rig.toml'}:{guessed}{ahead}then run capsule-id check {folder}")
     return 0

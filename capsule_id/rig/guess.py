@@ -5,7 +5,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise, product, takewhile
 from pathlib import Path
 from typing import Literal
@@ -27,9 +27,10 @@ from capsule_id.rig.formats.raw import (
     TextFile,
     lines_of,
 )
-from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps, shown_cell
+from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.times import evened
+from capsule_id.rig.toml import shown
 from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si, scale, symbol_named
 
 # headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
@@ -192,6 +193,8 @@ _DIGITS = re.compile(rb"[0-9]+")
 Cells = tuple[str | None, int] | None
 #: Cells of successive rows, their number, and the lines of the first and the last one, counted from 1.
 Run = tuple[Cells, int, int, int]
+#: Columns of readings and of single numbers, and the errors of all others, by index.
+Readings = tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]
 _RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
 
 
@@ -220,9 +223,9 @@ class FoundLayout:
     columns: dict[int, np.ndarray]
     unread: dict[int, InputError]
     rate: float | None
-    stamps: frozenset[int] = frozenset()
-    blocks: tuple[tuple[int, int], ...] = ()
-    labels: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    stamps: frozenset[int]
+    blocks: tuple[tuple[int, int], ...]
+    labels: Mapping[int, tuple[str, ...]]
 
     def header(self, index: int, dimensions: Sequence[str]) -> tuple[str, str]:
         """Name of a column, and the text of its unit: that of its header, else that of the row of units, or ""."""
@@ -249,20 +252,19 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
     """
     suffix = suffix_of(path)
     if suffix not in EXPORTS:
-        known = " ".join(EXPORTS)
-        raise InputError(f"a file must have a known format ({known})", path.name, "export it as CSV", path)
+        raise InputError(f"a file must have a known format ({' '.join(EXPORTS)})", path.name, "export it as CSV", path)
     text = suffix.removesuffix(COMPRESSED) in TEXTS and not suffix.startswith(".lvm")
     beginning = _beginning(TextFile(content, path)) if text else b""
     blocks: tuple[tuple[int, int], ...] = ()
     layout = Layout(missing=NO_READING, sheet=sheet)
 
-    def read(layout: Layout) -> tuple[Export, tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]]:
+    def read(layout: Layout) -> tuple[Export, Readings]:
         """The export, and what ``_readings`` finds in it: a column of readings at least."""
         export = EXPORTS[suffix](content, path, layout)
         found = _readings(export)
         if not found[0]:
-            nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
-            raise next(iter(found[2].values()), InputError(*nothing, path))
+            nothing = InputError("a file must have a column of numbers", "none", "export the readings as numbers", path)
+            raise next(iter(found[2].values()), nothing)
         return export, found
 
     try:
@@ -279,29 +281,23 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
         export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
-    stamps = {index: values for index in unread if (values := _stamps(content, export, layout, index)) is not None}
+    numbers = tuple(index + 1 for index in unread)
+    again = EXPORTS[suffix](content, path, replace(layout, columns=numbers, words=numbers)) if numbers else export
+    texts = {index: again.words(index).tolist() for index in unread} if again.words else {}
+    stamps = {index: values for index in texts if (values := _stamps(texts[index], export, layout, index)) is not None}
     read_too = {index: error for index, error in unread.items() if index not in stamps}
-    rate, labels = _rate(beginning, names, singles), dict[int, tuple[str, ...]]()
-    for index in (i for i in unread if any(fits_name(names[i], word) > 0 for word in LABELS)):
-        labels[index] = tuple(sorted({*_texts(content, export, layout, index)}))
-    every = {**columns, **stamps}
+    rate, every = _rate(beginning, names, singles), {**columns, **stamps}
+    labelled = [index for index in texts if any(fits_name(names[index], word) > 0 for word in LABELS)]
+    labels = {index: tuple(sorted({*texts[index]})) for index in labelled}
     return FoundLayout(export, layout, names, units, every, read_too, rate, frozenset(stamps), blocks, labels)
 
 
-def _stamps(content: bytes, export: Export, layout: Layout, index: int) -> np.ndarray | None:
+def _stamps(texts: list[str], export: Export, layout: Layout, index: int) -> np.ndarray | None:
     """A column of time stamps that increase, (n,) s since the first one; None for another column."""
     with suppress(InputError):
-        texts = _texts(content, export, layout, index)
         values = seconds_of_stamps(texts, layout.missing, lambda row: export.place(row, index))
         return values if np.nanmax(values) > 0.0 and increases(values) else None
     return None
-
-
-def _texts(content: bytes, export: Export, layout: Layout, index: int) -> list[str]:
-    """The texts of a column; [] where the format has none."""
-    layout = replace(layout, columns=(index + 1,), words=(index + 1,))
-    again = EXPORTS[suffix_of(export.path)](content, export.path, layout)
-    return [] if again.words is None else again.words(index).tolist()
 
 
 def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
@@ -384,8 +380,12 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
             if not columns and unread:
                 first = first or unread[min(unread)]
             if columns and len(export.lines) == 1:
-                rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
-                first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
+                few = (
+                    "an export must have two rows of numbers or more",
+                    "one row",
+                    "export all readings into one file",
+                )
+                first = first or InputError(*few, path, int(export.lines[0]))
             if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
                 runs, longest = _runs([beginning], layout) if line is not None else ([], None)
                 if any(run[2] < (line or 0) for run in runs if longest is not None and run[0] == longest):
@@ -395,7 +395,7 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
     raise first
 
 
-def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]:
+def _readings(export: Export) -> Readings:
     """The columns of readings, all of the most frequent length; the columns of one number; errors of all others."""
     columns: dict[int, np.ndarray] = {}
     singles: dict[int, float] = {}
@@ -623,7 +623,7 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
 def lines_of_labels(found: FoundLayout, kind: KindRule) -> Iterable[tuple[str, str]]:
     """Settings that part the rows of a friction table by the texts of a column, and why."""
     for index, texts in found.labels.items() if "direction" in kind.setting_rules else ():
-        source, held = source_of(found, index), " ".join(map(shown_cell, texts))
+        source, held = source_of(found, index), " ".join(map(shown, texts))
         if len(texts) > 1 and fits_name(found.names[index], "surface") > 0:
             key = source if source.startswith('"') else f'"{source}"'
             yield f'where = {{ {key} = "{UNKNOWN}" }}', f"one capsule has one surface in a fit: write one of {held}"

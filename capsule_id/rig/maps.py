@@ -211,11 +211,9 @@ def text_rule(what: str, example: str) -> PlainRule:
 
 
 LAYOUT: Mapping[str, SettingRule] = {
-    "data_from_line": PlainRule(
-        is_count, "be a line, counted from 1", "write the line of the first reading, such as 2", WHOLE
-    ),
-    "data_to_line": PlainRule(
-        is_count, "be a line, counted from 1", "write the line of the last reading, such as 2", WHOLE
+    **dict.fromkeys(
+        ("data_from_line", "data_to_line"),
+        PlainRule(is_count, "be a line, counted from 1", "write the line of that reading, such as 2", WHOLE),
     ),
     "missing": PlainRule(
         lambda value: isinstance(value, list) and all(isinstance(text, str) for text in value),
@@ -230,7 +228,7 @@ LAYOUT: Mapping[str, SettingRule] = {
 #: Keys of an experiment that go with ``columns``.
 MAP_KEYS = ("columns", "files", *LAYOUT, "where", "plateaus")
 #: A finite number without unit.
-NUMBER = PlainRule(is_number, "be a finite number", "write a number without quotes")
+NUMBER = PlainRule(is_number, "be a finite number", "write a number without quotes, or leave it out")
 _EXAMPLE = '{ from = "...", unit = "..." }'
 Header = str | int  #: a header, or a column's number counted from 1
 
@@ -255,23 +253,8 @@ class Source:
     rate: float | None = None
 
 
-@dataclass(frozen=True)
-class Range:
-    """Numbers from ``min`` to ``max``, both included, in the unit of the file; or one number, which is both of them."""
-
-    min: float
-    max: float
-
-    def __str__(self) -> str:
-        if self.min == self.max:
-            return f"{self.min:.15g}"
-        if self.max == inf:
-            return f"{self.min:.15g} or more"
-        return f"{self.max:.15g} or less" if self.min == -inf else f"{self.min:.15g} to {self.max:.15g}"
-
-
-#: What selects the rows of a column: numbers in the unit of the file, or a text.
-Wanted = Range | str
+#: What selects the rows of a column: numbers from the first to the second, both included, in the unit of the file; or a text.
+Wanted = tuple[float, float] | str
 
 
 @dataclass(frozen=True)
@@ -363,13 +346,10 @@ def _source(node: Node, rule: ColumnRule) -> Source:
 def _header(node: Node) -> Header:
     """A header, or a number counted from 1."""
     key, value = node.key, node.value
-    if isinstance(value, int) and not isinstance(value, bool):
-        if value < 1:
-            raise node.error("columns are counted from 1", str(value), "write 1 for the first column")
+    if is_count(value):
         return value
-    node.require(
-        isinstance(value, str), "be a header or the number of a column", f'write {key} = 1 or {key} = "<header>"'
-    )
+    rule = "be a header or the number of a column, counted from 1"
+    node.require(isinstance(value, str), rule, f'write {key} = 1 or {key} = "<header>"')
     named = f"name the column that holds {node.path[-2]}"
     node.require(value != UNKNOWN, named, "write its header, or its number counted from 1")
     return " ".join(node.text().split())
@@ -381,19 +361,14 @@ def _wanted(node: Node) -> Wanted:
     if isinstance(value, str):
         return value.strip()
     if not isinstance(value, dict):
-        number = float(NUMBER.read(node))
-        return Range(number, number)
+        return (number := float(NUMBER.read(node))), number
     node.refuse_unknown(("min", "max"))
     if not value:
         raise node.error("a range must have min or max", "none", "write { min = 2, max = 10 }, or one of them")
-    for key in value:
-        finite = not isinstance(value[key], float) or is_number(value[key])
-        node[key].require(finite, "be a finite number", f"leave {key} out")
     low, high = (float(NUMBER.read(node[k])) if k in node else end for k, end in (("min", -inf), ("max", inf)))
-    found = Range(low, high)
-    if found.min > found.max:
-        raise node.error("min must not exceed max", str(found), "exchange them")
-    return found
+    if low > high:
+        raise node.error("min must not exceed max", shown(value), "exchange them")
+    return low, high
 
 
 # mapped: Applies a column map: selects, combines and scales the columns of one file or several.
@@ -446,8 +421,10 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
             texts = np.concatenate(own).tolist()
             values[name] = seconds_of_stamps(texts, column_map.layout.missing, partial(place, column=names.index(name)))
             continue
-        scaled = [_scaled(part, one, node[name], source) for part, one in zip(parts, own, strict=True)]
-        values[name] = np.concatenate(scaled)
+        if source.minus is not None:
+            own = [one - part.find(node[name]["minus"], source.minus)[0] for part, one in zip(parts, own, strict=True)]
+        with np.errstate(over="ignore"):
+            values[name] = np.concatenate(own) * source.scale + source.offset
     where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
     keep, missing = _kept(node, values, where)
     for name, source in column_map.sources.items():
@@ -558,23 +535,22 @@ class _Part:
 
 def _selected_by(parts: Sequence[_Part], node: Node, wanted: Wanted) -> tuple[np.ndarray, np.ndarray]:
     """The rows whose column, named by the key of ``node``, has what is ``wanted``, and those without a value, (n,)."""
-    key, is_text = node.key, isinstance(wanted, str)
-    header = _header_named(key, parts)
-    column = np.concatenate([part.find(node, header, is_text)[0] for part in parts])
+    header = _header_named(node.key, parts)
+    column = np.concatenate([part.find(node, header, isinstance(wanted, str))[0] for part in parts])
     if isinstance(wanted, str):
         rows, unknown = column == wanted, column == ""
     else:
         # 0.1 + 0.2 is 0.3; times since 1970 in microseconds keep their digits.
-        ends = np.array([wanted.min, wanted.max])
+        ends = np.array(wanted)
         low, high = ULPS * np.array([-1, 1]) * np.spacing(np.where(np.isfinite(ends), np.abs(ends), 0.0)) + ends
         rows, unknown = (column >= low) & (column <= high), np.isnan(column)
     if not rows.any():
         raise node.error(
-            f"where must keep a row; column {shown(key)} holds {_held(column, wanted)}",
-            shown(wanted) if is_text else str(wanted),
-            "widen the range"
-            if isinstance(wanted, Range) and wanted.min < wanted.max
-            else "write one of the values of the column",
+            f"where must keep a row; column {shown(node.key)} holds {_held(column, wanted)}",
+            shown(node.value),
+            "write one of the values of the column"
+            if isinstance(wanted, str) or wanted[0] == wanted[1]
+            else "widen the range",
         )
     return rows, unknown
 
@@ -589,18 +565,10 @@ def _header_named(key: str, parts: Sequence[_Part]) -> Header:
 def _held(column: np.ndarray, wanted: Wanted) -> str:
     """What a column, (n,) texts or numbers, holds where nothing is ``wanted``, in words."""
     seen = np.unique(column if isinstance(wanted, str) else column[~np.isnan(column)])
-    if isinstance(wanted, Range) and wanted.min < wanted.max and seen.size:
+    if not isinstance(wanted, str) and wanted[0] < wanted[1] and seen.size:
         return f"{seen[0]:.15g} to {seen[-1]:.15g}"
     texts = [shown(str(one)) if isinstance(wanted, str) else f"{one:.15g}" for one in seen[: _MOST_VALUES + 1]]
     return " ".join(texts[:_MOST_VALUES]) + " …" * (len(texts) > _MOST_VALUES) or "no number"
-
-
-def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.ndarray:
-    """The values of a column in its stated unit."""
-    if source.minus is not None:
-        values = values - part.find(node["minus"], source.minus)[0]
-    with np.errstate(over="ignore"):
-        return values * source.scale + source.offset
 
 
 def _kept(

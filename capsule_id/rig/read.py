@@ -200,11 +200,12 @@ def _read_experiments(
     """Every ``[[experiment]]``, and the sha256 of every file read; errors are appended to ``faults``."""
     entries = root.get("experiment", [])
     if not isinstance(entries.value, list) or not entries.value:
-        rule, remedy = (
+        none = entries.error(
             "a rig must have at least one [[experiment]]",
+            shown(entries.value),
             'add [[experiment]] with kind = "..." and file = "..."',
         )
-        raise_all([*faults, entries.error(rule, shown(entries.value), remedy)])
+        raise_all([*faults, none])
     tables: list[Table] = []
     files: dict[str, str] = {}
     for index, label in enumerate(_default_labels(entries.value)):
@@ -413,9 +414,8 @@ def _parted(
         directed = bool(name) and "direction" in vars(settings)
         if directed and fits_name(split := entry["split_by"].text(), "surface") > 0:
             rule = "one fit has one surface: the rows of one alone may be used"
-            raise entry["split_by"].error(
-                rule, split, f'write where = {{ "{split}" = "{name}" }} in place of split_by', True
-            )
+            remedy = f'write where = {{ "{split}" = "{name}" }} in place of split_by'
+            raise entry["split_by"].error(rule, split, remedy, of_key=True)
         backward = directed and fits_name(name, "backward") > 0
         here = replace(settings, **{"direction": "backward"}) if backward else settings
         yield f"{label}_{end}" if name else label, here, raw
@@ -507,10 +507,7 @@ def _file_nodes(entry: Node) -> list[Node]:
         raise node.error("an experiment has file or files", "both", "remove file", of_key=True)
     files = isinstance(node.value, list) and bool(node.value)
     node.require(files, "be a list of files", 'write files = ["...", "..."]')
-    found = [node[index] for index in range(len(node.value))]
-    for each in found:
-        each.text()
-    return found
+    return [node[index] for index in range(len(node.value))]
 
 
 def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTable:
@@ -550,10 +547,10 @@ def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str
 
     ``error`` makes the error about a column from rule, value and remedy.
     """
+    sets = ", or ".join(" and ".join(columns) for columns in kind.sets)
     for name in names:
         if name not in kind.columns:
             if name == "time":
-                sets = ", or ".join(" and ".join(columns) for columns in kind.sets)
                 raise error(
                     name,
                     f"{kind.name} must be a table of trials",
@@ -565,17 +562,13 @@ def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str
             raise error(name, f"unknown column in {kind.name}", shown(name), remedy)
     stated = {name for name in names if name not in (*kind.channels, *kind.optional)}
     if stated not in [set(columns) for columns in kind.sets]:
-        wanted = ", or ".join(" and ".join(columns) for columns in kind.sets)
-        raise error(
-            names[0], f"{kind.name} must have the columns {wanted}", " and ".join(names), "add or remove columns"
-        )
+        raise error(names[0], f"{kind.name} must have the columns {sets}", " and ".join(names), "add or remove columns")
     if kind.channels and not set(kind.channels).intersection(names):
-        wanted = " ".join(kind.channels)
         raise error(
             names[0],
             f"{kind.name} must have a channel beside {' and '.join(sorted(stated))}",
             " ".join(names),
-            f"add one of {wanted}",
+            f"add one of {' '.join(kind.channels)}",
         )
 
 

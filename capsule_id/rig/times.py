@@ -127,25 +127,20 @@ def remedy_of_order(raw: RawTable, index: int) -> str:
     copies = np.sort(equal[1:][np.all([one[equal[1:]] == one[equal[:-1]] for one in raw.columns], axis=0)])
     order = np.argsort(time, kind="stable")
     rough = [sum(float(np.sum(np.abs(np.diff(c[rows])))) for c in raw.columns) for rows in (order, slice(None))]
-    # A clock that stood still makes up for the lost time in one step.
-    levels, counts = np.unique(time, return_counts=True)
-    even = (time[-1] - time[0]) / (len(time) - 1)
-    made_up = np.all(np.abs(np.diff(levels) - counts[:-1] * even)[counts[:-1] > 1] < 0.5 * even)
+    counts = np.unique(time, return_counts=True)[1]
     where, repeated = (
         f"line {' '.join(map(str, raw.rows[rows][:_MOST_LINES]))}{' …' if len(rows) > _MOST_LINES else ''}"
         for rows in (back, copies)
     )
     files, rows = f"at {counted(len(back), 'row')} ({where}): write a file of each record", counted(len(back), "row")
-    still = "the clock stands still and then goes on; delete the rows with a repeated time:"
     causes = (
         (rising and not few, f"{' '.join(rising)} increases in every row and {name} does not: exchange the headers of "
          f"{name} and {' '.join(rising)}, or their from in a column map"),
         (len(copies) and np.all(np.diff(np.delete(time, copies)) > 0.0),
          f"delete the repeated rows: {repeated}"),
-        (not falls and len(back) <= STANDS * len(time) and made_up, f"{still} {where}"),
         (not falls, f"the times are rounded, up to {counted(int(counts.max()), 'row')} share one: export them with more "
-         "digits"),
-        (len(levels) == len(time) and rough[0] <= rough[1],
+         f"digits, or delete the rows with a repeated time: {where}"),
+        (len(counts) == len(time) and rough[0] <= rough[1],
          f"sort the rows by {name}: in that order the readings are smoother"),
         (few, f"the clock is set back {files}"),
     )  # fmt: skip

@@ -74,7 +74,7 @@ def test_files_without_a_common_signal_are_refused(tmp_path: Path, capsys: pytes
     for words, part in (
         (["--clock-of", str(a), "--common", "trigger"], "must have the column trigger"),
         (["--clock-of", str(a)], "must stand together"),
-        (["--clock-of", str(b), "--common", "x_rel [mm]"], "must name another file"),
+        (["--clock-of", str(b), "--common", "x_rel [mm]"], "name another file"),
     ):
         assert cli.capsule_id(["import", str(b), *words]) == 2
         assert part in capsys.readouterr().err

@@ -237,7 +237,11 @@ def test_of_two_columns_that_fit_alike_none_is_sure(
         ("0.0000,", "00:00:00.000,", "'Time (s)' is not read: line 2 has '00:00:00.000'. Export times as seconds"),
         (",2.500\n", ",OVER\n", "'Disp (mm)' is not read: line 2 has 'OVER'. Correct the cell"),
         (",2.500\n", ",2:500\n", "'Disp (mm)' is not read: line 2 has '2:500'. Correct the cell"),
-        ("0.1995,", "Mean,", "'Time (s)' is not read: line 401 has 'Mean'. Correct the cell or delete the row"),
+        (
+            "0.1995,",
+            "Mean,",
+            "'Time (s)' is not read: line 401 has 'Mean'. Correct the cell, or add \"Mean\" to missing",
+        ),
     ],
 )
 def test_a_column_with_a_cell_that_is_no_number_is_named(

@@ -243,7 +243,7 @@ X = 'x_rel = { from = "Disp (mm)", unit = "mm" }'
 FAULTS = [
     ('"Disp (mm)"', '‸"Disp [mm]"', "must be a header", 'write "Disp (mm)"', '"Disp (mm)"'),
     ('"Disp (mm)"', "‸3", "one of the 2 columns", "a number from 1 to 2", "2"),
-    ('"Disp (mm)"', "‸0", "counted from 1", "write 1 for the first column", "2"),
+    ('"Disp (mm)"', "‸0", "counted from 1", "write from = 1", "2"),
     ('"Disp (mm)"', "‸true", "must be a header or the number", "from = 1", "2"),
     (X, 'x_rel = ‸{ from = "Disp (mm)" }', "must have a unit", 'add unit = "m"', X),
     (X, 'x_rel = ‸{ unit = "mm" }', "must have a from", 'write { from = "...", unit = "..." }', X),

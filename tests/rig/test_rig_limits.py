@@ -169,11 +169,11 @@ def test_a_table_with_missing_cells_is_read_at_once(monkeypatch: pytest.MonkeyPa
     """Before: 16 MB of 2000 columns, one of them without readings, took 15 s: every cell was read by itself."""
     seen = list[str]()
     number_in = texts.number_in
-    monkeypatch.setattr(texts, "number_in", lambda cell, mark: seen.append(cell) or number_in(cell, mark))
+    monkeypatch.setattr(texts, "number_in", lambda cell, *mark: seen.append(cell) or number_in(cell, *mark))
     row = ",".join(["1"] * 99) + ",--\n"
     with pytest.raises(InputError, match=r"^table.csv:2:199: a cell must not be empty"):
         read_csv((",".join(f"c{i} [1]" for i in range(100)) + "\n" + row * 50).encode(), TABLE)
-    assert len(seen) < 10  # two kinds of cells
+    assert len(seen) < 100  # missing markers alone, of which none may be a number
 
 
 def test_the_reader_in_c_reads_the_blocks_without_missing_cells(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -200,13 +200,12 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
 
 def unit_stated(attributes: Mapping[Any, Any]) -> str:
     """The unit among the attributes of a column, texts or bytes by name; "" where they state none."""
-    for key in attributes:
-        name, unit = (key.decode("utf-8", "replace") if isinstance(key, bytes) else key), ""
-        if name.lower() in UNIT_NAMES:
-            unit = attributes[key].decode("utf-8", "replace") if isinstance(attributes[key], bytes) else attributes[key]
-        if isinstance(unit, str) and unit.strip():
-            return unit
-    return ""
+    texts = [
+        [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in pair]
+        for pair in attributes.items()
+    ]
+    units = (unit for name, unit in texts if name.lower() in UNIT_NAMES and isinstance(unit, str) and unit.strip())
+    return next(units, "")
 
 
 def _unreadable(found: Any) -> Iterator[str]:

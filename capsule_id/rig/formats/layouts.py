@@ -2,10 +2,10 @@
 
 import csv
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from capsule_id.rig.formats.raw import (
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
+    Rows,
     Shape,
     are_words,
     bare,
@@ -33,11 +34,10 @@ from capsule_id.rig.formats.text import (
     is_stamp,
     number_in,
     place_of_cell,
-    read_column,
     rows_of,
-    shown_cell,
     texts_of,
 )
+from capsule_id.rig.toml import shown
 
 # any layout: Reads text exports of any layout: titles, headers, rows of units, comments, and any separator.
 #
@@ -71,7 +71,7 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
         if cell.count('"') % 2:  # rows such as "10,2","1,5": the separator would cut quoted numbers in two
             raise InputError(
                 "a cell in quotation marks must not hold the separator of the cells",
-                shown_cell(row.strip()),
+                shown(row.strip()),
                 "export with a decimal point, or with semicolons between the cells",
                 file.path,
                 first + 1,
@@ -91,7 +91,8 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
     rows = rows_of(file, shape, wanted, None, words) if are_words(layout.missing) else None
-    rows = rows or rows_of(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
+    stated = decimal is not None and layout.decimal == decimal
+    rows = rows or rows_of(file, replace(shape, decimal=decimal, stated=stated), wanted, layout.missing, words)
     assert rows is not None, "any cell is read with a list of markers"
     lines = rows.lines
 
@@ -104,16 +105,12 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
     """The text down to ``data_to_line``, where that is stated."""
-    file, last = TextFile(content, path, layout.data_to_line), layout.data_to_line or 0
-    if last and last > (number := sum(text.count(b"\n") for _, text in file.blocks())):
-        raise InputError(
-            f"data_to_line must be a line of the file, which has {number}",
-            str(last),
-            "state the line of the last reading",
-            path,
-            max(number, 1),
-            1,
-        )
+    file = TextFile(content, path, layout.data_to_line)
+    for key in ("data_from_line", "data_to_line"):
+        stated = getattr(layout, key) or 0
+        if stated and stated > (number := sum(text.count(b"\n") for _, text in file.blocks())):
+            rule, remedy = f"{key} must be a line of the file, which has {number}", "state the line of that reading"
+            raise InputError(rule, str(stated), remedy, path, max(number, 1), 1)
     return file
 
 
@@ -131,7 +128,7 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
         If there is none, or the first line with a number is no row of readings.
     """
     lines: list[str] = []
-    begun = None
+    begun, row = None, 0
     for i, line in enumerate(file.lines()):
         lines.append(line)
         if i >= MOST_TITLES and layout.data_from_line is None:
@@ -144,27 +141,12 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
             continue
         cells = split_bare(line, delimiter_of(line, layout))
         if begun is None and any(is_number(cell) for cell in cells):
-            begun, cells = i, _mapped(cells, lines, layout)
+            begun, row, cells = i, i, _mapped(cells, lines, layout)
         if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
             if i == begun:
                 return lines
-            raise InputError(
-                "the first line with a number must be a row of readings",
-                shown_cell(lines[begun].strip()),
-                f"state data_from_line = {i + 1}, or the line of the first reading",
-                file.path,
-                begun + 1,
-                1,
-            )
-    if layout.data_from_line is not None and layout.data_from_line > len(lines):
-        raise InputError(
-            f"data_from_line must be a line of the file, which has {len(lines)}",
-            str(layout.data_from_line),
-            "state the line of the first reading",
-            file.path,
-            max(len(lines), 1),
-            1,
-        )
+            row = i
+            break
     if begun is None:
         raise InputError(
             f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
@@ -175,9 +157,9 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
             1,
         )
     raise InputError(
-        "data_from_line must be stated where no row has numbers only",
-        shown_cell(lines[begun].strip()),
-        f"state data_from_line = {begun + 1}, or the line of the first reading",
+        "the first line with a number must be a row of readings, or data_from_line stated",
+        shown(lines[begun].strip()),
+        f"state data_from_line = {row + 1}, or the line of the first reading",
         file.path,
         begun + 1,
         1,
@@ -253,7 +235,7 @@ def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, l
         return
     raise InputError(
         "a comma between digits must be stated as a separator or a decimal mark",
-        shown_cell(file.line(first).strip()),
+        shown(file.line(first).strip()),
         'state decimal = "," for one column of numbers, decimal = "." for two',
         file.path,
         first + 1,
@@ -281,7 +263,7 @@ def _is_reading(cell: str, layout: Layout) -> bool:
 _END = "***End_of_Header***"
 _SPECIAL, _END_SPECIAL = "***Start_Special***", "***End_Special***"
 _TIMES, _COMMENT = "X_Value", "Comment"
-_REMEDY = "export the record again"
+_REMEDY = "rename a file of plain columns to .txt, or export the record again"
 
 
 @dataclass(frozen=True)
@@ -329,12 +311,12 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
     labels, channels = segments[0].keys.get("Y_Unit_Label", []), [name for name in names if name != _TIMES]
     units = dict(zip(channels, labels, strict=False)) if len({*channels}) == len(channels) else {}
     headers += [tuple(units.get(name, "") for name in headers[0])] if any(units.values()) else []
-    stored = _by_cells(text, segments, separator, decimal, layout.missing)
-    lines = np.concatenate([np.arange(segment.first, segment.stop) for segment in segments]) + 1
+    rows = _rows_of_segments(text, segments, separator, decimal, layout.missing)
+    lines = rows.lines
 
     def values(column: int) -> np.ndarray:
         if (source := sources[column]) >= 0:
-            return stored(source)
+            return rows.column(source)
         pairs = zip(clocks[source], segments, strict=True)
         return np.concatenate([start + step * np.arange(part.stop - part.first) for (start, step), part in pairs])
 
@@ -358,7 +340,7 @@ def _clock(segment: _Segment, channel: int, decimal: str | None, path: Path) -> 
     if start is None or step is None or not np.isfinite([start, step]).all() or step <= 0.0:
         raise InputError(
             "a file without times must state X0 and a positive Delta_X for every channel",
-            shown_cell(" ".join(cells)),
+            shown(" ".join(cells)),
             _REMEDY,
             path,
             segment.first + 1,
@@ -367,74 +349,51 @@ def _clock(segment: _Segment, channel: int, decimal: str | None, path: Path) -> 
     return start, step
 
 
-def _by_cells(
+def _rows_of_segments(
     text: TextFile, segments: Sequence[_Segment], separator: str, decimal: str | None, missing: Sequence[str]
-) -> Callable[[int], np.ndarray]:
-    """The numbers of a column of the file; blank cells at the end of a segment are no readings."""
-    lines = [*text.lines()]
-    tables = [[line.split(separator) for line in lines[segment.first : segment.stop]] for segment in segments]
-
-    def column(index: int) -> np.ndarray:
-        parts = []
-        for segment, rows in zip(segments, tables, strict=True):
-            texts = [row[index].strip(BLANKS + '"') if index < len(row) else "" for row in rows]
-            while len(texts) > 1 and not texts[-1]:
-                texts.pop()
-
-            def place(k: int, first: int = segment.first) -> Place:
-                line = lines[first + k]
-                return text.path, first + k + 1, place_of_cell(line, separator, index, len(line) + 1)
-
-            parts.append(read_column(texts, decimal, missing, place))
-        return np.concatenate(parts)
-
-    return column
+) -> Rows:
+    """The rows of all segments, each with as many cells as there are names; all other lines count as blank."""
+    width, lines = len(segments[0].names), [*text.lines()]
+    table = [""] * len(lines)
+    for number in chain.from_iterable(range(segment.first, segment.stop) for segment in segments):
+        cells = (lines[number] + separator * width).split(separator)[:width]
+        # A row that begins as a comment does is one of cells.
+        table[number] = separator.join(f'"{cell}' if is_comment(cell) else cell for cell in cells)
+    file, shape = TextFile("\n".join(table).encode(), text.path), Shape(segments[0].first, separator, width, decimal)
+    rows = rows_of(file, shape, range(width), missing)
+    assert rows is not None, "any cell is read with a list of markers"
+    return rows
 
 
 def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segment]]:
     """Separator, cells of the file's header by key, and segments; special blocks between them are skipped."""
-    path, segments = text.path, list[_Segment]()
-    if not any(line.strip().startswith(_END) for line in text.lines()):
-        raise InputError(
-            f"a .lvm file must have a header that ends with {_END}",
-            "none",
-            "rename a file of plain columns to .txt, or export the record again",
-            path,
-            1,
-            1,
-        )
-    stated = next((line for line in text.lines() if line.startswith("Separator")), "")
-    separator = "," if stated.startswith("Separator,") else "\t"
-    head: dict[str, list[str]] | None = None
-    keys, names, state, first, special, number = dict[str, list[str]](), [""], "header", 0, False, 0
-    for number, line in enumerate(chain(text.lines(), ["", ""])):
-        if state == "rows":
-            if line.strip() and not line.startswith(("***", "Channels")):
-                continue
-            if number == first:
-                raise InputError("a segment must have rows", "none", _REMEDY, path, first, 1)
-            segments.append(_Segment(keys, tuple(names), first, number))
-            if names != [*segments[0].names]:
-                raise InputError(
-                    "segments must have the same columns", shown_cell(" ".join(names)), _REMEDY, path, first, 1
-                )
-            keys, state = {}, "header"
-        key, *cells = (cell.strip() for cell in line.split(separator))
-        if state == "names":
-            names = [" ".join(name.split()) for name in (key, *cells)]
-            while names and names[-1] in ("", _COMMENT):
-                names.pop()
-            state, first = "rows", number + 1
-            continue
-        special = (special or key == _SPECIAL) and key != _END_SPECIAL
-        if key == _END and not special:
-            head, keys, state = (keys, {}, state) if head is None else (head, keys, "names")
-        elif not special and key not in ("", _END_SPECIAL):
-            keys[key] = cells
-    if head is None or keys:
-        raise InputError(f"a header must end with {_END}", "the end of the file", _REMEDY, path, number, 1)
-    if not segments:
-        raise InputError("a LabVIEW measurement file must have a segment", "none", _REMEDY, path, number, 1)
-    if len(segments[0].names) < 2:
-        raise InputError("a segment must have channels", "none", _REMEDY, path, segments[0].first, 1)
-    return separator, head, segments
+    lines, special, segments = list[str](), False, list[_Segment]()
+    for line in text.lines():
+        special = (special or line.startswith(_SPECIAL)) and not line.startswith(_END_SPECIAL)
+        lines.append("" if special or line.startswith(_END_SPECIAL) else line)
+    separator = "," if any(line.startswith("Separator,") for line in lines) else "\t"
+
+    def header(first: int, stop: int) -> dict[str, list[str]]:
+        cells = ([cell.strip() for cell in line.split(separator)] for line in lines[first:stop])
+        return {key: others for key, *others in cells if key}
+
+    end, *ends = [k for k, line in enumerate(lines) if line.strip().startswith(_END)] or [0]
+    stop = end + 1
+    for number in ends:
+        found = [" ".join(name.split()) for name in [*lines, ""][number + 1].split(separator)]
+        while found and found[-1] in ("", _COMMENT):
+            found.pop()
+        rows = takewhile(lambda line: line.strip() and not line.startswith(("***", "Channels")), lines[number + 2 :])
+        keys, first = header(stop, number), number + 2
+        segments.append(_Segment(keys, tuple(found), first, stop := first + len([*rows])))
+    names = {segment.names for segment in segments}
+    for holds, rule, number in (
+        (end, f"a .lvm file must have a header that ends with {_END}", 1),
+        *((one.stop > one.first, "a segment must have rows", one.first) for one in segments),
+        (len(names) < 2, "segments must have the same columns", stop),
+        (not header(stop, len(lines)), f"a header must end with {_END}", stop + 1),
+        (min(map(len, names), default=0) > 1, "a LabVIEW measurement file must have a segment with channels", stop),
+    ):
+        if not holds:
+            raise InputError(rule, shown([*lines, ""][number - 1]), _REMEDY, text.path, number, 1)
+    return separator, header(0, end), segments

@@ -148,7 +148,8 @@ class TextFile:
             else raw.decode(_CODECS[self.encoding]).encode()
         )
         text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
-        self._text = _with_points(text.replace(b" -> ", b"\t"))  # behind the time stamps of a serial monitor
+        # A serial monitor writes an arrow behind the time stamp of each line.
+        self._text = _with_points(re.sub(rb"(?m)^([0-9:.,]+) -> ", rb"\1\t", text) if b" -> " in text else text)
         if last is not None:
             ends = np.append(np.flatnonzero(np.frombuffer(self._text, np.uint8) == ord("\n")), len(self._text))
             self._text = self._text[: ends[min(last, len(ends)) - 1] + 1]
@@ -237,18 +238,12 @@ def _encoding(raw: bytes, path: Path) -> str:
         fault = error.start
     if marked:
         raise InputError(rule, "damaged UTF-16", "save it as UTF-8", path, *place_of_byte(raw[:fault], codec))
-    wrong = fault if not raw[:fault].isascii() else None
-    if wrong is None and (found := _NOT_WINDOWS.search(raw)):
-        wrong = found.start()
-    if wrong is not None:
-        raise InputError(
-            "the file must be UTF-8 text",
-            f"byte 0x{raw[wrong : wrong + 1].hex()}",
-            "save it as UTF-8",
-            path,
-            *place_of_byte(raw[:wrong], codec),
-        )
-    return WINDOWS
+    found = _NOT_WINDOWS.search(raw)
+    if found is None and raw[:fault].isascii():
+        return WINDOWS
+    wrong = found.start() if found and raw[:fault].isascii() else fault
+    value, place = f"byte 0x{raw[wrong : wrong + 1].hex()}", place_of_byte(raw[:wrong], codec)
+    raise InputError("the file must be UTF-8 text", value, "save it as UTF-8", path, *place)
 
 
 def lines_of(text: bytes) -> list[str]:
@@ -269,14 +264,8 @@ def place_of_byte(before: bytes, codec: str = "utf-8") -> tuple[int, int]:
 NO_READING = tuple(
     dict.fromkeys(
         text
-        for word in ("", "-", "--", "---", "NaN", "NA", "N/A", "#N/A", "null", "none")
-        for text in (
-            word,
-            word.lower(),
-            word.upper(),
-            word.capitalize(),
-            *([f"-{word}", f"-{word.lower()}"] * (word == "NaN")),
-        )
+        for word in ("", "-", "--", "---", "NaN", "-NaN", "NA", "N/A", "#N/A", "null", "none")
+        for text in (word, word.lower(), word.upper(), word.capitalize())
     )
 )
 
@@ -410,9 +399,7 @@ def refuse_line(layout: Layout, path: Path) -> None:
             raise InputError(f"a {path.suffix} file has no {key}", f"{key} = {value}", f"remove {key}", path)
 
 
-def export_of_arrays(
-    arrays: Mapping[str, np.ndarray], path: Path, layout: Layout, units: Mapping[str, str] | None = None
-) -> Export:
+def export_of_arrays(arrays: Mapping[str, np.ndarray], path: Path, layout: Layout, units: Mapping[str, str]) -> Export:
     """The columns of named arrays: every vector, and every column of a matrix, ``data(:,2)`` for the second.
 
     A matrix far wider than high holds its channels in rows: ``data(2,:)`` for the second.
@@ -442,7 +429,7 @@ def export_of_arrays(
                 form = "({},:)" if rows else "(:,{})"
                 own = {name + form.format(i + 1): one for i, one in enumerate(array if rows else array.T)}
             columns |= own
-            stated += [(units or {}).get(name, "")] * len(own)
+            stated += [units.get(name, "")] * len(own)
     refuse_wide(len(columns) or widest, path)
     if not columns:
         raise InputError(

@@ -5,18 +5,17 @@ import json
 import math
 import re
 import sys
-from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import date
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import NO_READING, Place, RawTable, TextFile, lines_of, refuse_wide
+from capsule_id.rig.toml import shown
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -39,7 +38,6 @@ _APART = {
 # Only with such an exponent may a number be below the smallest float64: its cells are then read one by one.
 _TINY = re.compile("[eE]-0*(?:[1-9][0-9]{3}|[3-9][0-9]{2})")
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
-_LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
 
 def cells_of(line: str, delimiter: str | None) -> list[tuple[str, int]]:
@@ -87,35 +85,17 @@ def number_in(cell: str, decimal: str, apart: bool = False) -> float | None:
     return None if _NUMBER.fullmatch(written) is None else float(written)
 
 
-def read_number(cell: str, path: Path, line: int, column: int, decimal: str = ".") -> float:
-    """One cell as a finite number.
-
-    Raises
-    ------
-    InputError
-        At ``line`` and ``column`` if it is no number.
-    """
-    if not cell:
-        remedy = "write a number; a table must have a row without missing cells"
-        raise InputError("a cell must not be empty", "nothing", remedy, path, line, column)
-    value = number_in(cell, decimal)
-    if value is None:
-        if cell.lower().lstrip("+-") in ("inf", "infinity"):
-            raise InputError("a cell must be a finite number", cell, "delete the row", path, line, column)
-        raise InputError(
-            "a cell must be a number",
-            shown_cell(cell),
-            "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file",
-            path,
-            line,
-            column,
-        )
-    if is_beyond_floats(value, cell):
-        rule, remedy = ("finite number", "a smaller number: float64 ends at 1.8e308")
-        if value == 0.0:
-            rule, remedy = "number that float64 holds", "0: float64 begins at 5e-324"
-        raise InputError(f"a cell must be a {rule}", shown_cell(cell), f"write {remedy}", path, line, column)
-    return value
+def no_number(cell: str, value: float | None, place: Place) -> InputError:
+    """The error about a cell that is no number (None), or whose ``value`` float64 does not hold."""
+    infinite = cell.lower().lstrip("+-") in ("inf", "infinity")
+    missing = f"or add {json.dumps(cell, ensure_ascii=False)} to missing = [...] to drop its row"
+    causes = (
+        (value == 0.0, "number that float64 holds", "write 0: float64 begins at 5e-324"),
+        (infinite or value is not None, "finite number", "write a smaller number: float64 ends at 1.8e308"),
+        (True, "number", f"correct the cell, {missing}"),
+    )
+    rule, remedy = next((rule, remedy) for holds, rule, remedy in causes if holds)
+    return InputError(f"a cell must be a {rule}", shown(cell), remedy, *place)
 
 
 def is_beyond_floats(value: float, written: str) -> bool:
@@ -165,25 +145,12 @@ def read_column(
             if np.isfinite(values[used]).all() and (values[used].all() or not _TINY.search("\n".join(texts))):
                 return values
     apart = mark in mark_apart("\n".join(texts))
-    for k, text in enumerate(texts):
-        if text in missing:
-            continue
-        value = number_in(text, mark, apart)
-        if value is None:
-            raise InputError(
-                "a cell must be a number",
-                shown_cell(text),
-                f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row",
-                *place(k),
-            )
-        values[k] = read_number(text, *place(k), mark) if is_beyond_floats(value, text) else value
+    for k in used:
+        value = number_in(texts[k], mark, apart)
+        if value is None or is_beyond_floats(value, texts[k]):
+            raise no_number(texts[k], value, place(k))
+        values[k] = value
     return values
-
-
-def shown_cell(cell: str) -> str:
-    """A faulty cell for an error line: printable and short."""
-    text = repr(cell)
-    return text if len(text) <= _LONGEST_QUOTED else text[:_LONGEST_QUOTED] + "…"
 
 
 # stamps: Dates and times of day as seconds since the first one.
@@ -212,15 +179,15 @@ def seconds_of_stamps(texts: Sequence[str], missing: Sequence[str], place: Calla
         At the first text that is no stamp, or where the dates are none.
     """
     found = [_STAMP.fullmatch(text) for text in texts]
-    wrong = next(
-        (k for k, (text, one) in enumerate(zip(texts, found, strict=True)) if not one and text not in missing), None
-    )
     known = [k for k, one in enumerate(found) if one]
-    if wrong is not None or not known:
-        wrong = wrong or 0
-        remedy = "correct the cell, or state the unit of the numbers, such as s"
-        rule = "a time stamp must be a time of day, such as 12:34:56.789, with or without a date"
-        raise InputError(rule, shown_cell(texts[wrong]), remedy, *place(wrong))
+    wrong = [k for k, one in enumerate(found) if not one and (not known or texts[k] not in missing)]
+    if wrong:
+        raise InputError(
+            "a time stamp must be a time of day, such as 12:34:56.789, with or without a date",
+            shown(texts[wrong[0]]),
+            "correct the cell, or state the unit of the numbers, such as s",
+            *place(wrong[0]),
+        )
     stamps = [one for one in found if one]
     clocks = np.array([_clock(one) for one in stamps])
     days = list[np.ndarray]()
@@ -228,9 +195,7 @@ def seconds_of_stamps(texts: Sequence[str], missing: Sequence[str], place: Calla
         with suppress(ValueError):
             days.append(np.array([_day(one, first) for one in stamps]))
     if not days:
-        raise InputError(
-            "the date of a time stamp must exist", shown_cell(texts[known[0]]), "correct it", *place(known[0])
-        )
+        raise InputError("the date of a time stamp must exist", shown(texts[known[0]]), "correct it", *place(known[0]))
     turn = 24 * _HOUR if stamps[0]["tail"] is None else _HOUR
     day = min(days, key=np.ptp)  # 03/04/2024: the order of day and month that makes the record shorter
     if not day.any():
@@ -283,6 +248,7 @@ class Shape:
     delimiter : separator; None: any number of spaces and tabs
     width : cells of a row
     decimal : decimal mark; None: that of each column
+    stated : ``rig.toml`` states the decimal mark: the other one separates thousands
     trailing : every row ends with a separator and a blank cell, which is not counted
     """
 
@@ -291,6 +257,7 @@ class Shape:
     width: int
     decimal: str | None
     trailing: bool = False
+    stated: bool = False
 
 
 @dataclass(frozen=True)
@@ -299,13 +266,15 @@ class Rows:
 
     Attributes
     ----------
-    numbers : of each column that is read: those of every block, or the error at its first cell that is no number
+    numbers : of each column that is read: those of every block
+    faults : of a column, the error at its first cell that is no number
     texts : of each column whose texts are kept
     blocks : 1-based lines of the rows of every block
     """
 
-    numbers: dict[int, list[np.ndarray | InputError]]
+    numbers: dict[int, list[np.ndarray]]
     texts: dict[int, list[str]]
+    faults: dict[int, InputError] = field(default_factory=dict)
     blocks: list[np.ndarray] = field(default_factory=list)
 
     @property
@@ -321,12 +290,9 @@ class Rows:
         InputError
             At the first cell that is neither a number nor a missing marker.
         """
-        parts = [np.empty(0)]
-        for part in self.numbers[index]:
-            if isinstance(part, InputError):
-                raise part
-            parts.append(part)
-        return np.concatenate(parts)
+        if index in self.faults:
+            raise self.faults[index]
+        return np.concatenate([np.empty(0), *self.numbers[index]])
 
     def words(self, index: int) -> np.ndarray:
         """The texts of a column, (rows,), as objects: one long text must not widen all."""
@@ -353,10 +319,10 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     """
     delimiter, decimal, count = shape.delimiter, shape.decimal or ".", text.count(b"\n")
     allowed = f"{_PLAIN}{delimiter or ''}{decimal}\n".encode()
-    if not text.strip() or text.translate(None, allowed):
-        return None
     # Rows with a last cell have all cells, by the number of separators. Cells between spaces are counted by the reader.
-    if delimiter is not None and text.count(delimiter.encode()) != count * (shape.width - 1 + shape.trailing):
+    separators = count * (shape.width - 1 + shape.trailing)
+    parted = delimiter is None or text.count(delimiter.encode()) == separators
+    if not (text.strip() and parted) or text.translate(None, allowed):
         return None
     used = list(range(shape.width)) if delimiter is None else sorted({*columns, shape.width - 1})
     lines = io.StringIO((text.replace(b",", b".") if decimal == "," else text).decode())
@@ -365,11 +331,10 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
         values = np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
     except ValueError:
         return None
-    if values.shape != (count, len(used)) or not np.isfinite(values).all():
-        return None
-    if not values.all() and _TINY.search(text.decode()):
-        return None
-    return values[:, np.searchsorted(used, columns)]
+    whole = values.shape == (count, len(used)) and np.isfinite(values).all()
+    # A number below the smallest float64 would be 0.
+    exact = whole and (values.all() or not _TINY.search(text.decode()))
+    return values[:, np.searchsorted(used, columns)] if exact else None
 
 
 def are_words(missing: Sequence[str]) -> bool:
@@ -400,7 +365,8 @@ def rows_of(
         # No other decimal mark than that of the reader in C can be meant.
         plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
         values = plain_block(block, shape, columns) if plain else None
-        kept = [*_rows_in(number, block)] if values is None else []
+        every = enumerate(lines_of(block) if values is None else (), number)
+        kept = [(line, row) for line, row in every if is_row(row)]
         if values is None and plain and len(kept) < block.count(b"\n"):  # blank lines or comments
             values = plain_block("\n".join([*(text for _, text in kept), ""]).encode(), shape, columns)
         if values is None and kept and missing is None:
@@ -413,10 +379,11 @@ def rows_of(
             continue
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         turned = [*zip(*cells, strict=True)] or [()] * shape.width
-        apart = (_apart(turned, markers) if shape.decimal is None else {}) if apart is None else apart
+        if apart is None:
+            apart = _apart(turned, markers, shape.decimal) if shape.decimal is None or shape.stated else {}
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
-            texts = [text.replace(apart[column], "") for text in texts] if column in apart else texts
+            texts = [text.replace(mark, "") for text in texts] if (mark := apart.get(column, "")) else texts
             if column in words:
                 rows.texts[column] += map(sys.intern, texts)
             marks[column] = marks[column] or decimal_mark(texts, markers)
@@ -426,31 +393,41 @@ def rows_of(
                 return file.path, line + 1, place_of_cell(text, shape.delimiter, column)
 
             try:
+                if mark is None:
+                    raise _ambiguous(texts, place)
                 rows.numbers[column].append(read_column(texts, marks[column] or ".", markers, place))
             except InputError as error:
-                rows.numbers[column].append(error)
+                rows.faults.setdefault(column, error)
     return rows
 
 
-def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str]) -> dict[int, str]:
+def _ambiguous(texts: Sequence[str], place: Callable[[int], Place]) -> InputError:
+    """The error about the first of these numbers, with a mark before its last three digits."""
+    k = next(k for k, text in enumerate(texts) if text[-4:-3] in (".", ","))
+    other = "," if texts[k][-4] == "." else "."
+    rule = f"whether 1{texts[k][-4:]} is a thousand must be stated where a column has {other!r} for decimal mark"
+    remedy = f'state decimal = "{other}" if it is, or write its numbers with that decimal mark'
+    return InputError(rule, shown(texts[k]), remedy, *place(k))
+
+
+def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str], decimal: str | None) -> dict[int, str | None]:
     """The point or the comma between thousands, by column, where all cells with it may be such numbers: 1,234 and 998.
 
-    Other columns show the other mark, or many cells with it stand beside whole numbers of three digits at most.
+    The other mark is the stated ``decimal`` one, or many cells stand beside whole numbers of three digits at most. None:
+    another column alone shows the other mark.
     """
     marks, lone = dict[int, str](), dict[int, bool]()
     for k, texts in enumerate(columns):
-        if (mark := decimal_mark(texts := [bare(text) for text in texts], missing)) is not None:
-            marked, marks[k] = [text for text in texts if mark in text], mark
+        mark = decimal_mark(texts := [bare(text) for text in texts], missing)
+        marked = [text for text in texts if mark and mark in text]
+        if mark and number_in(marked[0], mark) is not None:  # a date shows no decimal mark
+            marks[k] = mark
             whole = len(marked) >= FEWEST_APART and any(_SHORT.fullmatch(text) for text in texts)
             if all((found := _GROUPED.fullmatch(text)) and text[-4] == found["mark"] for text in marked):
-                lone[k] = whole
-    shown = {mark for k, mark in marks.items() if k not in lone}
-    return {k: marks[k] for k, whole in lone.items() if whole or shown == {*",."} - {marks[k]}}
-
-
-def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:
-    """The rows of a block with their 0-based lines; ``number`` is that of the first line."""
-    return ((line, row) for line, row in enumerate(lines_of(text), number) if is_row(row))
+                lone[k] = whole if decimal is None else mark != decimal
+    # A stated mark leaves nothing open.
+    others = {mark for k, mark in marks.items() if k not in lone} if decimal is None else set[str]()
+    return {k: marks[k] if sure else None for k, sure in lone.items() if sure or others == {*",."} - {marks[k]}}
 
 
 def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
@@ -458,14 +435,16 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
     cells = texts_of(text, shape.delimiter)
     cells = cells[:-1] if shape.trailing else cells
     if len(cells) != shape.width:
+        first = f"line {shape.first + 1}" if line > shape.first else "the header"
+        commas = " (decimal commas need semicolons or tabs between the cells)" * (shape.delimiter == ",")
+        ends = f"state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if they begin here"
         raise InputError(
-            f"a row must have {counted(shape.width, 'cell')}, as line {shape.first + 1} has",
+            f"a row must have {counted(shape.width, 'cell')}, as {first} has",
             counted(len(cells), "cell"),
-            f"correct the row, or state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if "
-            f"they begin here",
+            f"correct the row{commas}, or {ends}",
             path,
             line + 1,
-            1,
+            place_of_cell(text, shape.delimiter, shape.width, len(text) + 1),
         )
     return cells
 
@@ -479,6 +458,8 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
 # 1-based: the line of the file, and the character of that line at which the cell begins.
 
 
+_HEAD = "head each column `name [unit]`"
+_BLANK = ("lines between the first and the last must not be blank", "a blank line", "remove the line")
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 
 
@@ -498,104 +479,74 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     file = TextFile(content, path)
     header = file.line(0)
     if not header.strip():
-        first = (
-            "lines between the first and the last must not be blank",
-            "a blank line",
-            "put the header on the first line",
-        )
-        if not any(line.strip() for line in file.lines()):
-            first = (
-                "a table must not be empty",
-                "no text at all",
-                "write a header `name [unit]` per column and one row per reading",
-            )
-        raise InputError(*first, path, 1, 1)
+        empty = ("a table must not be empty", "no text at all", f"{_HEAD} and write a row per reading")
+        raise InputError(*(_BLANK if any(line.strip() for line in file.lines()) else empty), path, 1, 1)
     delimiter = next((mark for mark in "\t;," if mark in header), ",")
     refuse_wide(header.count(delimiter) + 1, path, 1)
     names, units = _header(header, delimiter, path)
     marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")
     shape = Shape(1, delimiter, len(names), decimal)
-    rows = rows_of(file, shape, range(len(names)))
-    end = 1 + len(rows.lines) if rows else 1
-    # Rows that follow one another, with blank lines alone below them.
-    whole = rows and end in rows.lines[-1:].tolist() and not any(line.strip() for line in file.lines(end))
-    columns = tuple(map(rows.column, range(len(names)))) if rows and whole else _read_cells(file, shape)
+    quoted = [
+        (cell, number + k + 1, column)
+        for number, block in file.blocks(1)
+        if b'"' in block
+        for k, text in enumerate(lines_of(block))
+        for cell, column in cells_of(text, delimiter)
+        if '"' in cell and bare(cell) not in NO_READING and is_row(text)
+    ]
+    for cell, *where in quoted:  # a mark may be left of a damaged cell
+        raise InputError("a cell must be a number", shown(cell), "remove the quotation marks", path, *where)
+    rows = rows_of(file, shape, range(len(names)), NO_READING)
+    assert rows is not None, "any cell is read with a list of markers"
+    lines, empty = rows.lines, _lines_without_cells(file, rows.lines)
 
     def place(row: int | None, column: int) -> Place:
-        line = 0 if row is None else row + 1
+        line = 0 if row is None else int(lines[row]) - 1
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    raw = RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
-    missing = np.any(np.isnan(columns), axis=0)
+    raw = RawTable(names, units, tuple(map(rows.column, range(len(names)))), lines, place, file.encoding)
+    missing = np.any(np.isnan(raw.columns), axis=0)
     if missing.all():  # the first cell of the first row that holds none
-        read_number("", *raw.place(0, int(np.argmax([np.isnan(column[0]) for column in columns]))))
-    return replace(raw.taken(np.flatnonzero(~missing)), lost=raw.rows[missing]) if missing.any() else raw
+        here = raw.place(0, int(np.argmax([np.isnan(column[0]) for column in raw.columns])))
+        remedy = "write a number; a table must have a row without missing cells"
+        raise InputError("a cell must not be empty", "nothing", remedy, *here)
+    lost = np.sort(np.append(lines[missing], empty).astype(int))
+    return replace(raw.taken(np.flatnonzero(~missing)), lost=lost) if len(lost) else raw
+
+
+def _lines_without_cells(file: TextFile, rows: np.ndarray) -> list[int]:
+    """1-based lines, besides the ``rows`` of a table, that hold separators alone.
+
+    Raises
+    ------
+    InputError
+        If there are no rows, at a comment, or at a blank line above the last row.
+    """
+    if not len(rows):
+        raise InputError("a table must have rows", "a header only", "add a row per reading", file.path, 1, 1)
+    if len(rows) == sum(text.count(b"\n") for _, text in file.blocks(1)):
+        return []
+    known = {*rows.tolist()}
+    others = [(number, text.strip()) for number, text in enumerate(file.lines(1), 2) if number not in known]
+    for number, text in others:
+        comment = ("a row must be numbers", shown(text), "remove comments from the table")
+        if is_comment(text) or (not text and number < rows[-1]):
+            raise InputError(*(comment if text else _BLANK), file.path, number, 1)
+    return [number for number, text in others if text]
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names and units of the columns."""
     units: dict[str, str] = {}
-    remedy = "head each column `name [unit]`, e.g. `time [s]` ([1]: no unit)"
+    remedy = f"{_HEAD}, e.g. `time [s]` ([1]: no unit)"
     for cell, column in cells_of(line, delimiter):
-        bare = cell[1:-1].strip() if len(cell) > 1 and cell[0] == cell[-1] == '"' else cell
-        if not bare:
-            raise InputError("every column must have a header", "an empty cell", remedy, path, 1, column)
-        found = _HEADER_CELL.fullmatch(bare)
+        found = _HEADER_CELL.fullmatch(bare(cell).strip())
         if found is None or not found[2].strip():
-            raise InputError("the first line must be headers `name [unit]`", shown_cell(bare), remedy, path, 1, column)
+            raise InputError("the first line must be headers `name [unit]`", shown(bare(cell)), remedy, path, 1, column)
         if found[1] in units:
             raise InputError(
                 "column names must be unique", f"a second {found[1]}", "remove or rename it", path, 1, column
             )
         units[found[1]] = found[2].strip()
     return tuple(units), tuple(units.values())
-
-
-def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
-    """The columns, read cell by cell, with NaN at missing ones; raises at the first fault."""
-    path, columns, mark, blank = file.path, shape.width, shape.decimal or ".", None
-    values = array("d")
-
-    @lru_cache(1 << 16)  # short cells are many, but many of them are the same
-    def number(cell: str) -> float:
-        value = number_in(cell, mark)
-        return math.nan if value is None or is_beyond_floats(value, cell) else value
-
-    for line, text in enumerate(file.lines(shape.first), shape.first + 1):
-        if not text.strip():
-            blank = blank or line
-            continue
-        if blank is not None:
-            raise InputError(
-                "lines between the first and the last must not be blank",
-                "a blank line",
-                "remove the line",
-                path,
-                blank,
-                1,
-            )
-        cells = texts_of(text, shape.delimiter)
-        if text.lstrip().startswith("#"):
-            raise InputError(
-                "a row must be numbers", shown_cell(text.strip()), "remove comments from the table", path, line, 1
-            )
-        if len(cells) != columns:
-            remedy = "give every row one cell per header"
-            if shape.delimiter == "," and len(cells) == 2 * columns:
-                remedy += " (a decimal comma needs semicolons or tabs between the cells)"
-            raise InputError(
-                f"a row must have {counted(columns, 'cell')}",
-                counted(len(cells), "cell"),
-                remedy,
-                path,
-                line,
-                place_of_cell(text, shape.delimiter, columns, len(text) + 1),
-            )
-        row = [*map(number, cells)]
-        values.extend(row)
-        for column in (k for k, one in enumerate(row) if math.isnan(one) and bare(cells[k]) not in NO_READING):
-            read_number(cells[column], path, line, place_of_cell(text, shape.delimiter, column), mark)
-    if not values:
-        raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
-    return tuple(np.array(values).reshape(-1, columns).T.copy())

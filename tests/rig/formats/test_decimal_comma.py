@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capsule_id.importing import propose_entry
 from tests.rig.test_column_maps import DISP, TIME, assert_read, fault_of, rig_of, rows
 
 
@@ -78,8 +79,38 @@ def test_points_or_commas_separate_thousands_where_a_cell_shows_it(tmp_path: Pat
     np.testing.assert_allclose(table["x_rel"][:2], [1e-3, 1.01e-3])
     for cells in (("0.5", "1,234"), ("999,5", "1.234"), ("1,5", "1,234.5,6")):
         assert "must be a number" in fault_of(tmp_path, text(*cells), lines).rule
-    # Another column shows the decimal mark, or whole numbers stand among many of three decimals.
-    for cells in ({f"{k / 8:.3f};{1000 + k:,}" for k in range(30)}, {f"{k};{985 + k:,}" for k in range(60)}):
-        ordered = sorted(cells, key=lambda row: float(row.split(";")[0]))
-        (table,) = rig_of(tmp_path, {"x.csv": "\n".join(ordered) + "\n"}, lines).tables
-        assert 0.98 < table["x_rel"].min() <= table["x_rel"].max() < 1.06
+    # Whole numbers stand among many of three decimals.
+    text = "".join(f"{k};{985 + k:,}\n" for k in range(60))
+    (table,) = rig_of(tmp_path, {"x.csv": text}, lines).tables
+    assert 0.98 < table["x_rel"].min() <= table["x_rel"].max() < 1.06
+
+
+@pytest.mark.parametrize(("decimal", "other"), [(",", "."), (".", ",")])
+def test_a_lone_mark_before_three_digits_is_ambiguous(tmp_path: Path, decimal: str, other: str) -> None:
+    """Before: the decimal mark of another column made 1.234 a thousand, and nothing said so."""
+    file = {"x.csv": "".join(f"{k / 8:.3f};1{other}{k:03}\n".replace(".", decimal, 1) for k in range(30))}
+    lines = f'file = "x.csv"\n{MAP_BY_NUMBER}'
+    fault = fault_of(tmp_path, file, lines)
+    assert (fault.line, fault.column, fault.value) == (1, 7, f"'1{other}000'")
+    (stated,) = re.findall('decimal = "[.,]"', fault.remedy)
+    assert stated == f'decimal = "{decimal}"'
+    (table,) = rig_of(tmp_path, {}, f"{lines}\n{stated}").tables
+    np.testing.assert_allclose(table["x_rel"][:2], [1.0, 1.001])
+    content = (f"Zeit (s);Weg (mm)\n{file['x.csv']}").encode()
+    (tmp_path / "y.csv").write_bytes(content)
+    assert f"'Weg (mm)' is not read: line 2 has '1{other}000'. State {stated}" in propose_entry(tmp_path / "y.csv")
+
+
+def test_the_points_of_a_date_are_no_decimal_marks(tmp_path: Path) -> None:
+    """Before: beside such stamps 1,234 was a thousand."""
+    text = "".join(f"01.03.2024 12:34:{k:02},5;1,{k:03}\n" for k in range(30))
+    mapped = 'columns = { time = { from = 1, unit = "stamp" }, x_rel = { from = 2, unit = "mm" } }'
+    (table,) = rig_of(tmp_path, {"x.csv": text}, f'file = "x.csv"\n{mapped}').tables
+    np.testing.assert_allclose(table["x_rel"][:2], [1e-3, 1.001e-3])
+
+
+def test_an_arrow_is_a_tab_behind_a_time_stamp_alone(tmp_path: Path) -> None:
+    """Before: the arrow of any header or note parted a cell in two."""
+    text = "".join(f"{t};{x};a -> b\n" for t, x in zip(TIME, DISP, strict=True))
+    columns = 'columns = { time = { from = "t", unit = "s" }, x_rel = { from = "x -> y", unit = "mm" } }'
+    assert_read(rig_of(tmp_path, {"x.csv": f"t;x -> y;note\n{text}"}, f'file = "x.csv"\n{columns}'))

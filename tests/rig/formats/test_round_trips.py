@@ -91,13 +91,13 @@ def test_channels_of_a_labview_file_with_different_rates_have_times_of_their_own
     ("fault", "repaired", "rule"),
     [
         ("***End_of_Header***", "***End_of_Header***", None),
-        ("X_Columns\tNo\n", "X_Columns\tOne\n", "columns must have equal lengths"),
+        ("X_Columns\tNo\n", "X_Columns\tOne\n", "a table must have rows, none is left"),
         ("Delta_X\t", "Delta_Y\t", "must state X0 and a positive Delta_X"),
         ("\tcurrent\t", "\tstrom\t", "must be a header"),
         (
             "***End_of_Header***",
             "***End***",
-            "must have a header that ends with .*, none, rename a file of plain columns",
+            "must have a header that ends with .*, rename a file of plain columns",
         ),
     ],
 )
