@@ -39,7 +39,7 @@ from capsule_id.inference.target import LogPosterior
 from capsule_id.inference.tuning import Tuning, tune
 from capsule_id.output import check_directory, publish, replace_file, work_in_progress
 from capsule_id.parameters import by_index, is_stated, symbol_of
-from capsule_id.physics.forces import Force, FrictionLaw
+from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
 from capsule_id.physics.model import CapsuleParameters, Drive, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.precision import prepare_xla
@@ -270,7 +270,9 @@ class Fit(Result):
                 f"state given={{{missing[0]!r}: ...}}, SI",
             )
         p = CapsuleParameters(**{leaf.name: values[leaf.name] for leaf in leaves if leaf.name in values})
-        return simulate(p, drive, times)
+        motion = simulate(p, drive, times)
+        warn_of_far_gap(p.G, motion.x_rel)
+        return motion
 
     def predict(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> pd.DataFrame:
         """Predict a new trial in a new session at each row of a table; see ``capsule_id.inference.prediction``."""

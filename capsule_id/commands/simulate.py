@@ -235,6 +235,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
     prepare_jax(not args.no_cache)
     from capsule_id.physics.drives import capsule_and_drive
+    from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.physics.model import Status, status_message
     from capsule_id.physics.simulation import simulate
     from capsule_id.physics.smooth.engine import Smoothing
@@ -253,6 +254,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("the run must be complete", status.name, status_message(t.status))
     if status is not Status.OK:
         complain(f"capsule-id simulate: {status_message(t.status)}")
+    warn_of_far_gap(p.G, t.x_rel)
     held = np.isin(times, grid)
     columns = {name: np.asarray(getattr(t, name))[held] for name in COLUMNS}
     with refusing("the output must be writable", "choose another name", args.out):

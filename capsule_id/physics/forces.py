@@ -461,7 +461,7 @@ def total(terms: Iterable[Any]) -> Any:
 
 def warn_of_far_gap(G: Any, r: Any) -> None:
     """Warn where every gap ``G``, m, is far beyond the motion ``r``, m; an infinite one means no spring."""
-    gap, reach = float(np.min(G)), float(np.max(np.abs(r), initial=0.0, where=np.isfinite(r)))
+    gap, reach = float(np.min(G)), float(np.nanmax(np.abs(r)))
     if max(FAR * reach, FAR_GAP) < gap < np.inf:
         text = f"the gap is {1e3 * gap:.4g} mm and the largest |x_rel| {1e3 * reach:.3g} mm: no contact. Is it in m?"
         warnings.warn(text, stacklevel=3)

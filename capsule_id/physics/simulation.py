@@ -15,15 +15,7 @@ from capsule_id.physics.batches import CHUNK, folded, is_traced, lanes_of, run_l
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.exact import engine as exact
 from capsule_id.physics.exact.taylor import constants_of
-from capsule_id.physics.forces import (
-    CoulombStribeck,
-    FrictionLaw,
-    downhill,
-    forces_of,
-    friction_law,
-    sliding_friction,
-    warn_of_far_gap,
-)
+from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, downhill, forces_of, friction_law, sliding_friction
 from capsule_id.physics.model import (
     MAX_STEPS,
     CapsuleParameters,
@@ -128,11 +120,10 @@ def simulate(
         _check_values(p, e, law, np.asarray(grid))
     if isinstance(e, RodMotion):
         initial = (*e.rod(grid[:, 0]), initial[2], initial[3])
-    kernel = exact.kernel(max_steps) if model == "exact" else smooth.kernel(smoothing, semantics, max_steps)
-    motion = run_lanes(kernel, (p, e, law, initial), grid, batched)
-    if not is_traced(motion) and np.any(p.k2):
-        warn_of_far_gap(p.G, motion.x_rel)
-    return motion
+    lanes = (p, e, law, initial)
+    if model == "exact":
+        return run_lanes(exact.kernel(max_steps), lanes, grid, batched)
+    return run_lanes(smooth.kernel(smoothing, semantics, max_steps), lanes, grid, batched)
 
 
 @dataclass(frozen=True)

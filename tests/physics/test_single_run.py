@@ -49,17 +49,6 @@ def test_a_single_run_is_that_of_a_batch(cases: Cases, n: int) -> None:
     assert int(one.contacts) == both.contacts[0] > 0
 
 
-def test_a_gap_far_beyond_the_motion_is_a_warning(cases: Cases, recwarn: pytest.WarningsRecorder) -> None:
-    """A gap in mm, say. (Before: the command and a result said so, not this function.)"""
-    p, e, T = cases.one("fig6_k2_20")
-    times = np.linspace(0.0, 4.0 * T, 50)
-    for changed in ({}, {"G": np.inf}, {"G": 1.0, "k2": 0.0}, {"G": 0.09}):
-        simulate(dataclasses.replace(p, **changed), e, times)
-    assert not recwarn.list
-    with pytest.warns(UserWarning, match=r"the gap is 1000 mm and the largest \|x_rel\| .* mm: no contact. Is it in m"):
-        simulate(dataclasses.replace(p, G=1.0), e, times)
-
-
 @pytest.mark.full
 def test_a_single_run_with_a_recorded_drive() -> None:
     batch = read_general_cases("recorded").one(1)
