@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, takewhile
@@ -24,7 +24,6 @@ from capsule_id.rig.formats.raw import (
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
-    Rows,
     Shape,
     are_words,
     bare,
@@ -311,12 +310,11 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
     labels, channels = segments[0].keys.get("Y_Unit_Label", []), [name for name in names if name != _TIMES]
     units = dict(zip(channels, labels, strict=False)) if len({*channels}) == len(channels) else {}
     headers += [tuple(units.get(name, "") for name in headers[0])] if any(units.values()) else []
-    rows = _rows_of_segments(text, segments, separator, decimal, layout.missing)
-    lines = rows.lines
+    lines, stored = _by_cells(text, segments, separator, decimal, layout.missing)
 
     def values(column: int) -> np.ndarray:
         if (source := sources[column]) >= 0:
-            return rows.column(source)
+            return stored(source)
         pairs = zip(clocks[source], segments, strict=True)
         return np.concatenate([start + step * np.arange(part.stop - part.first) for (start, step), part in pairs])
 
@@ -349,10 +347,10 @@ def _clock(segment: _Segment, channel: int, decimal: str | None, path: Path) -> 
     return start, step
 
 
-def _rows_of_segments(
+def _by_cells(
     text: TextFile, segments: Sequence[_Segment], separator: str, decimal: str | None, missing: Sequence[str]
-) -> Rows:
-    """The rows of all segments, each with as many cells as there are names; all other lines count as blank."""
+) -> tuple[np.ndarray, Callable[[int], np.ndarray]]:
+    """1-based lines of all rows, and the numbers of a column; blank cells at the end of a segment are no readings."""
     width, lines = len(segments[0].names), [*text.lines()]
     table = [""] * len(lines)
     for number in chain.from_iterable(range(segment.first, segment.stop) for segment in segments):
@@ -362,7 +360,15 @@ def _rows_of_segments(
     file, shape = TextFile("\n".join(table).encode(), text.path), Shape(segments[0].first, separator, width, decimal)
     rows = rows_of(file, shape, range(width), missing)
     assert rows is not None, "any cell is read with a list of markers"
-    return rows
+
+    def column(index: int) -> np.ndarray:
+        kept = np.ones(len(table), dtype=bool)
+        for segment in segments:
+            upwards = (texts_of(row, separator)[index] for row in table[segment.stop - 1 : segment.first : -1])
+            kept[segment.stop - len([*takewhile(lambda cell: not cell.strip('"'), upwards)]) : segment.stop] = False
+        return rows.column(index)[kept[rows.lines - 1]]
+
+    return rows.lines, column
 
 
 def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segment]]:

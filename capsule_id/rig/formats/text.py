@@ -403,11 +403,11 @@ def rows_of(
 
 def _ambiguous(texts: Sequence[str], place: Callable[[int], Place]) -> InputError:
     """The error about the first of these numbers, with a mark before its last three digits."""
-    k = next(k for k, text in enumerate(texts) if text[-4:-3] in (".", ","))
-    other = "," if texts[k][-4] == "." else "."
-    rule = f"whether 1{texts[k][-4:]} is a thousand must be stated where a column has {other!r} for decimal mark"
-    remedy = f'state decimal = "{other}" if it is, or write its numbers with that decimal mark'
-    return InputError(rule, shown(texts[k]), remedy, *place(k))
+    k, text = next((k, text) for k, text in enumerate(texts) if text[-4:-3] in (".", ","))
+    mark, other = ".,"[:: 1 if text[-4] == "." else -1]
+    rule = f"whether {text} is a thousand must be stated where a column has {other!r} for decimal mark"
+    remedy = f'state decimal = "{other}" if it is {text.replace(mark, "")}, else write {text.replace(mark, other)}'
+    return InputError(rule, shown(text), remedy, *place(k))
 
 
 def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str], decimal: str | None) -> dict[int, str | None]:

@@ -9,7 +9,7 @@ import pytest
 import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.rig.formats import EXPORTS
-from capsule_id.rig.formats.raw import Layout
+from capsule_id.rig.formats.raw import NO_READING, Layout
 from capsule_id.rig.model import Table
 from tests.rig.formats.writers import WRITERS, lvm, mat_5, tdms, xlsx
 
@@ -87,11 +87,22 @@ def test_channels_of_a_labview_file_with_different_rates_have_times_of_their_own
     np.testing.assert_allclose(table["time"], 2.0 * RUN["time"], rtol=ROUNDING)
 
 
+def test_a_channel_of_a_labview_file_that_ends_early_has_no_missing_readings(tmp_path: Path) -> None:
+    """Its cells are blank there; a blank cell between two readings is a missing one."""
+    lines = lvm(COLUMNS, "Multi").decode().split("\n")
+    rows = [k for k, line in enumerate(lines) if line[:1].isdigit()]
+    for k in [*rows[len(rows) // 2 :], rows[3]]:
+        lines[k] = "\t".join(cell if column < 2 else "" for column, cell in enumerate(lines[k].split("\t")))
+    export = EXPORTS[".lvm"]("\n".join(lines).encode(), Path("f.lvm"), Layout(missing=NO_READING))
+    assert [len(export.values(column)) for column in (0, 1, 3)] == [len(rows), len(rows), len(rows) // 2]
+    assert np.flatnonzero(np.isnan(export.values(3))).tolist() == [3]
+
+
 @pytest.mark.parametrize(
     ("fault", "repaired", "rule"),
     [
         ("***End_of_Header***", "***End_of_Header***", None),
-        ("X_Columns\tNo\n", "X_Columns\tOne\n", "a table must have rows, none is left"),
+        ("X_Columns\tNo\n", "X_Columns\tOne\n", "columns must have equal lengths"),
         ("Delta_X\t", "Delta_Y\t", "must state X0 and a positive Delta_X"),
         ("\tcurrent\t", "\tstrom\t", "must be a header"),
         (
