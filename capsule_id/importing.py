@@ -304,8 +304,12 @@ def read_file(path: Path) -> bytes:
     """
     with refusing("FILE must be readable", "check its permissions", path):
         if not path.is_file():
-            found = "a directory" if path.is_dir() else "no such file"
-            raise InputError("FILE must be a regular file", found, "correct the name", path)
+            raise InputError(
+                "FILE must be a regular file",
+                "a directory" if path.is_dir() else "no such file",
+                "correct the name",
+                path,
+            )
         return path.read_bytes()
 
 

@@ -87,12 +87,15 @@ def number_in(cell: str, decimal: str, apart: bool = False) -> float | None:
 
 def no_number(cell: str, value: float | None, place: Place) -> InputError:
     """The error about a cell that is no number (None), or whose ``value`` float64 does not hold."""
-    infinite = cell.lower().lstrip("+-") in ("inf", "infinity")
-    missing = f"or add {json.dumps(cell, ensure_ascii=False)} to missing = [...] to drop its row"
+    text = json.dumps(cell, ensure_ascii=False)
     causes = (
         (value == 0.0, "number that float64 holds", "write 0: float64 begins at 5e-324"),
-        (infinite or value is not None, "finite number", "write a smaller number: float64 ends at 1.8e308"),
-        (True, "number", f"correct the cell, {missing}"),
+        (
+            value is not None or cell.lower().lstrip("+-") in ("inf", "infinity"),
+            "finite number",
+            "write a smaller number: float64 ends at 1.8e308",
+        ),
+        (True, "number", f"correct the cell, or add {text} to missing = [...] to drop its row"),
     )
     rule, remedy = next((rule, remedy) for holds, rule, remedy in causes if holds)
     return InputError(f"a cell must be a {rule}", shown(cell), remedy, *place)
@@ -405,9 +408,12 @@ def _ambiguous(texts: Sequence[str], place: Callable[[int], Place]) -> InputErro
     """The error about the first of these numbers, with a mark before its last three digits."""
     k, text = next((k, text) for k, text in enumerate(texts) if text[-4:-3] in (".", ","))
     mark, other = ".,"[:: 1 if text[-4] == "." else -1]
-    rule = f"whether {text} is a thousand must be stated where a column has {other!r} for decimal mark"
-    remedy = f'state decimal = "{other}" if it is {text.replace(mark, "")}, else write {text.replace(mark, other)}'
-    return InputError(rule, shown(text), remedy, *place(k))
+    return InputError(
+        f"whether {text} is a thousand must be stated where a column has {other!r} for decimal mark",
+        shown(text),
+        f'state decimal = "{other}" if it is {text.replace(mark, "")}, else write {text.replace(mark, other)}',
+        *place(k),
+    )
 
 
 def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str], decimal: str | None) -> dict[int, str | None]:
