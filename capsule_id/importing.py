@@ -118,6 +118,9 @@ def _doubt(
 ) -> tuple[Confidence, str]:
     """Whether other columns leave the kind of the chosen candidate sure, and why."""
     used, kind = {column.index for column in chosen.columns.values()}, chosen.kind
+    readings = (k for k in found.unread if unit_of(found.header(k, every := dimensions_of(kinds))[1], every))
+    if (unread := next(readings, None)) is not None:
+        return "unsure", f"column {unread + 1}, {found.names[unread]!r}, has a cell that is no number"
     if TIME not in kind.columns and any(_is_record(found, i) for i in times_of(found) if i not in used):
         return "unsure", f"the file is a record in time, {kind.name} a table of trials"
     own = [one.columns for one in leading if one.kind is kind]
@@ -428,9 +431,16 @@ def _layout_lines(found: FoundLayout) -> Iterable[str]:
     used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
     label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{found.export.path.stem}_{used.sheet}") if used.sheet else None
     longest = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
+    # A record that a line of text interrupts is no record and a footer.
+    parted = sorted(last - first for first, last in found.blocks)[-2:-1] > [FEWEST_SAMPLES]
     for key, value, confidence, reason in (
         ("data_from_line", used.data_from_line, "sure", "the first row of readings"),
-        ("data_to_line", used.data_to_line, "likely", longest if len(found.blocks) > 1 else "the last row of readings"),
+        (
+            "data_to_line",
+            used.data_to_line,
+            "unsure" if parted else "likely",
+            f"{longest}; the others are not read" if len(found.blocks) > 1 else "the last row of readings",
+        ),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),
         ("sheet", used.sheet, "sure", "several sheets hold numbers, each has an entry"),
         ("label", label, "sure", "names of experiments differ"),

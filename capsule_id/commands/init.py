@@ -192,8 +192,8 @@ def run(args: argparse.Namespace) -> int:
         # A part of a table would be read as a table.
         replace_files({folder / file: text for file, text in contents.items() if (folder / file).resolve() not in own})
     guessed = "".join(
-        f"\n{file}: {'kind unsure' if one is None else one.kind}{', unsure' if one and one.unsure else ''}"
-        for file, (_, one) in guesses.items()
+        f"\n{file}: {'kind unsure' if one is None else one.kind}{', unsure' if one and '# unsure' in entry else ''}"
+        for file, (entry, one) in guesses.items()
     )
     ahead = (
         f"\ncheck its guesses, {'' if masses else 'state the masses, '}"

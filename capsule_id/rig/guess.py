@@ -187,6 +187,7 @@ def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:
 MOST_MISSING = 0.5
 _BEGINNING, _MOST_LINES = 100_000, 3_000  # bytes and lines in which the first row of readings is searched
 _MOST_TITLES = 100  # lines
+_FACTOR = re.compile(r"[*×]\s*[0-9][0-9.,]*|[0-9]\s*[*×]|\sx\s*(?:10+|0[.,][0-9]+)\b")
 _MOST_RUNS = 500_000  # of lines with equal cells, in which blocks of readings are searched
 _DIGITS = re.compile(rb"[0-9]+")
 #: Separator and number of cells of a line whose first cell is a number; None for any other line.
@@ -232,7 +233,9 @@ class FoundLayout:
         name, text = name_and_unit(self.names[index], dimensions)
         if index in self.stamps:
             return name if fits_name(name, TIME) > 0 else TIME, STAMP
-        return name, (text or self.units[index]).strip()
+        # What multiplies the readings is no part of a unit that may be taken as it is.
+        factor = _FACTOR.search(self.names[index])
+        return name, factor[0] if factor else (text or self.units[index]).strip()
 
 
 def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: str | None = None) -> FoundLayout:

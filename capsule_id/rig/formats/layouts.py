@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, takewhile
+from itertools import chain, islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Shape,
+    apart_marks,
     are_words,
     bare,
     cells_of,
@@ -89,7 +90,11 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
-    rows = rows_of(file, shape, wanted, None, words) if are_words(layout.missing) else None
+    first_rows = (texts_of(line, delimiter) for line in islice(filter(is_row, file.lines(first)), MOST_TITLES))
+    columns = zip(*(cells for cells in first_rows if len(cells) >= width), strict=False)
+    # The reader in C takes every mark for the decimal one.
+    quick = are_words(layout.missing) and (decimal is not None or not apart_marks([*columns], layout.missing, None))
+    rows = rows_of(file, shape, wanted, None, words) if quick else None
     stated = decimal is not None and layout.decimal == decimal
     rows = rows or rows_of(file, replace(shape, decimal=decimal, stated=stated), wanted, layout.missing, words)
     assert rows is not None, "any cell is read with a list of markers"

@@ -383,7 +383,7 @@ def rows_of(
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         turned = [*zip(*cells, strict=True)] or [()] * shape.width
         if apart is None:
-            apart = _apart(turned, markers, shape.decimal) if shape.decimal is None or shape.stated else {}
+            apart = apart_marks(turned, markers, shape.decimal) if shape.decimal is None or shape.stated else {}
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
             texts = [text.replace(mark, "") for text in texts] if (mark := apart.get(column, "")) else texts
@@ -409,31 +409,36 @@ def _ambiguous(texts: Sequence[str], place: Callable[[int], Place]) -> InputErro
     k, text = next((k, text) for k, text in enumerate(texts) if text[-4:-3] in (".", ","))
     mark, other = ".,"[:: 1 if text[-4] == "." else -1]
     return InputError(
-        f"whether {text} is a thousand must be stated where a column has {other!r} for decimal mark",
+        "whether a mark parts thousands or decimals must be stated where the column does not tell",
         shown(text),
-        f'state decimal = "{other}" if it is {text.replace(mark, "")}, else write {text.replace(mark, other)}',
+        f'state decimal = "{other}" if it is {text.replace(mark, "")}, decimal = "{mark}" if it is {text.replace(mark, ".")}',
         *place(k),
     )
 
 
-def _apart(columns: Sequence[Sequence[str]], missing: Sequence[str], decimal: str | None) -> dict[int, str | None]:
+def apart_marks(columns: Sequence[Sequence[str]], missing: Sequence[str], decimal: str | None) -> dict[int, str | None]:
     """The point or the comma between thousands, by column, where all cells with it may be such numbers: 1,234 and 998.
 
-    The other mark is the stated ``decimal`` one, or many cells stand beside whole numbers of three digits at most. None:
-    another column alone shows the other mark.
+    The other mark is the stated ``decimal`` one, or many cells stand beside a whole number of three digits at most that is
+    above all of them as decimals. None: few do, or another column alone shows the other mark.
     """
-    marks, lone = dict[int, str](), dict[int, bool]()
+    marks, lone = dict[int, str](), dict[int, bool | None]()
     for k, texts in enumerate(columns):
         mark = decimal_mark(texts := [bare(text) for text in texts], missing)
         marked = [text for text in texts if mark and mark in text]
         if mark and number_in(marked[0], mark) is not None:  # a date shows no decimal mark
             marks[k] = mark
-            whole = len(marked) >= FEWEST_APART and any(_SHORT.fullmatch(text) for text in texts)
             if all((found := _GROUPED.fullmatch(text)) and text[-4] == found["mark"] for text in marked):
-                lone[k] = whole if decimal is None else mark != decimal
+                # 2.501 is no number of a few beside -930 in its column.
+                largest = max(abs(number_in(text, mark) or 0.0) for text in marked)
+                above = any(_SHORT.fullmatch(text) and abs(int(text)) > largest for text in texts)
+                shows = (above and len(marked) >= FEWEST_APART) or (None if above else False)
+                lone[k] = shows if decimal is None else mark != decimal
     # A stated mark leaves nothing open.
     others = {mark for k, mark in marks.items() if k not in lone} if decimal is None else set[str]()
-    return {k: marks[k] if sure else None for k, sure in lone.items() if sure or others == {*",."} - {marks[k]}}
+    return {
+        k: marks[k] if sure else None for k, sure in lone.items() if sure is not False or others == {*",."} - {marks[k]}
+    }
 
 
 def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
