@@ -225,6 +225,41 @@ def test_compounds_and_slopes_are_known(tmp_path: Path, header: str, kind: str, 
         assert f'{line}{{ from = "{name}"' in entry
 
 
+def swing(rows: range, head: str = "Time (s),Disp (mm)\n") -> str:
+    """Rows of a decay in mm."""
+    return head + "".join(f"{5e-4 * k:.4f},{2.5 * np.exp(-2e-3 * k) * np.cos(0.06 * k):.4f}\n" for k in rows)
+
+
+@pytest.mark.parametrize("header", ["Disp*100 (mm)", "Disp x 10 (mm)", "Disp (mm) x0.1", "10^3*Disp (mm)"])
+def test_a_factor_in_a_header_leaves_the_unit_open(tmp_path: Path, header: str) -> None:
+    """Before: "sure" in mm, 100 times too large. Control: a sensor's number is no factor."""
+    for name, unit in ((header, "?"), ("Disp 2 (mm)", "mm"), ("x1 (mm)", "mm")):
+        (tmp_path / "d.csv").write_text(swing(range(900), f"Time (s),{name}\n"), encoding="utf-8")
+        assert f'from = "{name}", unit = "{unit}"' in capsule_id.importing.propose_entry(tmp_path / "d.csv")
+
+
+def test_a_record_that_a_line_interrupts_is_unsure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before: "likely", and 400 rows with the release were lost without a word. Control: a footer of three rows."""
+    for last, words in ((400, ", unsure"), (897, "")):
+        text = swing(range(last)) + "buffer overrun\n" + swing(range(last, 900), "")
+        (tmp_path / "d.csv").write_text(text, encoding="utf-8")
+        folder = tmp_path / f"rig_{last}"
+        assert cli.capsule_id(["init", str(folder), "--from", str(tmp_path / "d.csv")]) == 0
+        assert f"d.csv: free_vibration{words}\n" in capsys.readouterr().out
+        assert ("unsure: the end of the longest of 2" in (folder / "rig.toml").read_text(encoding="utf-8")) == bool(
+            words
+        )
+
+
+def test_a_cell_that_stops_a_column_leaves_the_kind_open(tmp_path: Path) -> None:
+    """Before: a motor table with one text was "sure" a table of pulls."""
+    rows = "0.5,1.05\n1.0,2.11\n1.5,3.14\n2.0,4.2\n"
+    for text, kind in (("", "motor_current"), ("slope,2.1\n", "static_friction")):
+        (tmp_path / "m.csv").write_text(f"Current (A),Force (N)\n{rows}{text}", encoding="utf-8")
+        doubt = "unsure: column 1, 'Current (A)', has a cell that is no number" if text else "sure"
+        assert f'kind = "{kind}"  # {doubt}' in capsule_id.importing.propose_entry(tmp_path / "m.csv")
+
+
 def test_only_the_column_without_a_name_is_called_so(tmp_path: Path) -> None:
     """Before: "no header names the column" for a column named Time too."""
     time = np.arange(0.0, 10.0, 0.1)

@@ -188,7 +188,7 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
                 continue
             readings += found.size
             refuse_large(READING * readings, content, path)
-            array, unit = _written(found), unit_stated(found.attrs)
+            array, unit = _unpacked(_written(found), found.attrs), unit_stated(found.attrs)
             yield name, np.ascontiguousarray(array.T if by_columns else array), unit
         objects: Any = [("", file), *((k, file[k]) for k, link in links.items() if isinstance(link, h5py.HardLink))]
         for name, found in objects:
@@ -196,6 +196,20 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
                 value = np.asarray(found.attrs[key])
                 if value.size == 1 and value.dtype.kind in "fiu":
                     yield f"{name}/{key}".lstrip("/"), value.reshape(1).astype(float), ""
+
+
+#: Attributes of the CF conventions by which readings are packed, and their values where they are not stated.
+_PACKED = {"scale_factor": 1.0, "add_offset": 0.0, "_FillValue": np.nan, "missing_value": np.nan}
+
+
+def _unpacked(array: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray:
+    """The readings that a packed array stands for: NaN at its fill values, all others scaled and moved."""
+    stated = {key: np.ravel(attributes[key]) for key in _PACKED if key in attributes}
+    numbers = {key: float(one[0]) for key, one in stated.items() if one.size and one.dtype.kind in "fiu"}
+    if not numbers:
+        return array
+    scale, offset, *fills = (numbers.get(key, default) for key, default in _PACKED.items())
+    return np.where(np.isin(array, fills), np.nan, array) * scale + offset
 
 
 def unit_stated(attributes: Mapping[Any, Any]) -> str:

@@ -397,21 +397,27 @@ def rows_of(
 
             try:
                 if mark is None:
-                    raise _ambiguous(texts, place)
+                    raise _ambiguous(texts, turned, place)
                 rows.numbers[column].append(read_column(texts, marks[column] or ".", markers, place))
             except InputError as error:
                 rows.faults.setdefault(column, error)
     return rows
 
 
-def _ambiguous(texts: Sequence[str], place: Callable[[int], Place]) -> InputError:
-    """The error about the first of these numbers, with a mark before its last three digits."""
+def _ambiguous(texts: Sequence[str], columns: Sequence[Sequence[str]], place: Callable[[int], Place]) -> InputError:
+    """The error about the first of these numbers, one of the columns, with a mark before its last three digits."""
     k, text = next((k, text) for k, text in enumerate(texts) if text[-4:-3] in (".", ","))
     mark, other = ".,"[:: 1 if text[-4] == "." else -1]
+    elsewhere = any(other in text for column in columns for text in column)
+    decimals = (
+        f"else write {text.replace(mark, other)}"
+        if elsewhere
+        else f'decimal = "{mark}" if it is {text.replace(mark, ".")}'
+    )
     return InputError(
         "whether a mark parts thousands or decimals must be stated where the column does not tell",
         shown(text),
-        f'state decimal = "{other}" if it is {text.replace(mark, "")}, decimal = "{mark}" if it is {text.replace(mark, ".")}',
+        f'state decimal = "{other}" if it is {text.replace(mark, "")}, {decimals}',
         *place(k),
     )
 

@@ -230,6 +230,19 @@ def test_the_process_that_reads_a_binary_file_imports_little() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_packed_readings_of_hdf5_are_unpacked(tmp_path: Path) -> None:
+    """By the CF conventions. Before: 100 times too large, and the fill value was a reading."""
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file["x"] = np.array([250, -100, -9999, 5], np.int16)
+        file["x"].attrs.update({"scale_factor": 0.01, "add_offset": 1.0, "_FillValue": np.int16(-9999), "units": "mm"})
+        file["plain"] = np.array([1, 2, 3, -9999], np.int16)
+    export = EXPORTS[".h5"](content.getvalue(), tmp_path / "f.h5", LAYOUT)
+    names = export.headers[0]
+    np.testing.assert_allclose(export.values(names.index("x")), [3.5, 0.0, np.nan, 1.05])
+    np.testing.assert_allclose(export.values(names.index("plain")), [1.0, 2.0, 3.0, -9999.0])
+
+
 def test_only_numbers_of_an_archive_are_columns() -> None:
     """Texts, objects and MATLAB's characters are no columns."""
     for suffix, content in ((".npz", npz(COLUMNS)), (".mat", mat_73(COLUMNS)), (".h5", hdf5(COLUMNS))):

@@ -101,6 +101,25 @@ def test_a_lone_mark_before_three_digits_is_ambiguous(tmp_path: Path, decimal: s
     assert f"'Weg (mm)' is not read: line 2 has '1{other}000'. State {stated}" in propose_entry(tmp_path / "y.csv")
 
 
+@pytest.mark.parametrize(("decimal", "other"), [(",", "."), (".", ",")])
+def test_whole_numbers_above_all_decimals_show_thousands(tmp_path: Path, decimal: str, other: str) -> None:
+    """Before: 2.501 beside -930 in one column was 2.501, and nothing said so. Control: 42.501 alone is a decimal."""
+    lines = f'file = "x.txt"\n{MAP_BY_NUMBER}'
+    whole = np.round(2500 * np.cos(0.2 * np.arange(200)))
+    text = "".join(f"{k}\t{x:,.0f}\n".replace(",", other) for k, x in enumerate(whole))
+    (table,) = rig_of(tmp_path, {"x.txt": text}, lines).tables
+    np.testing.assert_allclose(table["x_rel"], 1e-3 * whole)
+    few = "".join(f"{x:,}\t{k}\n".replace(",", other) for k, x in enumerate(range(500, 6500, 500)))
+    fault = fault_of(tmp_path, {"x.txt": few}, lines)
+    assert (fault.line, fault.value) == (2, f"'1{other}000'")
+    for stated, time in zip(re.findall('decimal = "[.,]"', fault.remedy), (1000.0, 1.0), strict=True):
+        (table,) = rig_of(tmp_path, {"x.txt": few.replace("500\t0\n", "")}, f"{lines}\n{stated}").tables
+        assert table["time"][0] == pytest.approx(time)
+    plain = "".join(f"{k}\t{42501 - 7 * k:,}\n".replace(",", decimal) for k in range(60))
+    (table,) = rig_of(tmp_path, {"x.txt": plain}, lines).tables
+    assert table["x_rel"][0] == pytest.approx(0.042501)
+
+
 def test_the_points_of_a_date_are_no_decimal_marks(tmp_path: Path) -> None:
     """Before: beside such stamps 1,234 was a thousand."""
     text = "".join(f"01.03.2024 12:34:{k:02},5;1,{k:03}\n" for k in range(30))
