@@ -90,7 +90,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
-    first_rows = (texts_of(line, delimiter) for line in islice(filter(is_row, file.lines(first)), MOST_TITLES))
+    first_rows = (
+        texts_of(line, delimiter) for line in islice(filter(is_row, file.lines(first)), 1 + 2 * MOST_TITLES // width)
+    )
     columns = zip(*(cells for cells in first_rows if len(cells) >= width), strict=False)
     # The reader in C takes every mark for the decimal one.
     quick = are_words(layout.missing) and (decimal is not None or not apart_marks([*columns], layout.missing, None))
