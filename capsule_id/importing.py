@@ -75,11 +75,6 @@ class Guess:
     confidence: Confidence
     reason: str
 
-    @property
-    def unsure(self) -> bool:
-        """Whether the kind or any column is a guess without a reason."""
-        return "unsure" in (self.confidence, *(column.confidence for column in self.columns.values()))
-
 
 def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     """The most probable kind and columns of an export; None where no kind fits."""

@@ -23,7 +23,9 @@ def guessed(export: Layouted) -> tuple[FoundLayout, Guess | None]:
 
 def outcome(export: Layouted, found: FoundLayout, said: Guess | None) -> str:
     """ "right", "wrong" or "asked"."""
-    if said is None or said.unsure or any(one.asked or one.unit == UNKNOWN for one in said.columns.values()):
+    if said is None or "unsure" in (said.confidence, *(one.confidence for one in said.columns.values())):
+        return "asked"
+    if any(one.asked or one.unit == UNKNOWN for one in said.columns.values()):
         return "asked"
     # One channel of a record may do without another.
     left = set(export.columns) - set(said.columns) - {*KINDS[said.kind].channels}

@@ -14,7 +14,7 @@ from capsule_id.experiments.kind import default_registry
 from capsule_id.rig import guess
 from capsule_id.rig.formats import EXPORTS, raw
 from capsule_id.rig.formats import text as texts
-from capsule_id.rig.formats.raw import MOST_COLUMNS, Layout, TextFile
+from capsule_id.rig.formats.raw import MOST_COLUMNS, NO_READING, Layout, TextFile
 from capsule_id.rig.formats.text import read_csv
 from capsule_id.rig.toml import DEEPEST_KEY, LARGEST_TEXT, closest, parse_toml
 from tests.cli_tools import small_rig
@@ -173,7 +173,7 @@ def test_a_table_with_missing_cells_is_read_at_once(monkeypatch: pytest.MonkeyPa
     row = ",".join(["1"] * 99) + ",--\n"
     with pytest.raises(InputError, match=r"^table.csv:2:199: a cell must not be empty"):
         read_csv((",".join(f"c{i} [1]" for i in range(100)) + "\n" + row * 50).encode(), TABLE)
-    assert len(seen) < 100  # missing markers alone, of which none may be a number
+    assert len([cell for cell in seen if cell not in NO_READING]) < 10  # none of the markers may be a number
 
 
 def test_the_reader_in_c_reads_the_blocks_without_missing_cells(monkeypatch: pytest.MonkeyPatch) -> None:

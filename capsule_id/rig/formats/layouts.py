@@ -390,13 +390,15 @@ def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segmen
         cells = ([cell.strip() for cell in line.split(separator)] for line in lines[first:stop])
         return {key: others for key, *others in cells if key}
 
+    lines += ["", ""]  # a header at the end of the file has neither names nor rows
     end, *ends = [k for k, line in enumerate(lines) if line.strip().startswith(_END)] or [0]
     stop = end + 1
     for number in ends:
-        found = [" ".join(name.split()) for name in [*lines, ""][number + 1].split(separator)]
+        found = [" ".join(name.split()) for name in lines[number + 1].split(separator)]
         while found and found[-1] in ("", _COMMENT):
             found.pop()
-        rows = takewhile(lambda line: line.strip() and not line.startswith(("***", "Channels")), lines[number + 2 :])
+        below = (lines[k] for k in range(number + 2, len(lines)))
+        rows = takewhile(lambda line: line.strip() and not line.startswith(("***", "Channels")), below)
         keys, first = header(stop, number), number + 2
         segments.append(_Segment(keys, tuple(found), first, stop := first + len([*rows])))
     names = {segment.names for segment in segments}
@@ -408,5 +410,5 @@ def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segmen
         (min(map(len, names), default=0) > 1, "a LabVIEW measurement file must have a segment with channels", stop),
     ):
         if not holds:
-            raise InputError(rule, shown([*lines, ""][number - 1]), _REMEDY, text.path, number, 1)
+            raise InputError(rule, shown(lines[number - 1]), _REMEDY, text.path, number, 1)
     return separator, header(0, end), segments

@@ -389,6 +389,8 @@ def rows_of(
             texts = [text.replace(mark, "") for text in texts] if (mark := apart.get(column, "")) else texts
             if column in words:
                 rows.texts[column] += map(sys.intern, texts)
+            if column in rows.faults:  # the first fault counts, and a later block may not show it
+                continue
             marks[column] = marks[column] or decimal_mark(texts, markers)
 
             def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> Place:
@@ -400,7 +402,7 @@ def rows_of(
                     raise _ambiguous(texts, turned, place)
                 rows.numbers[column].append(read_column(texts, marks[column] or ".", markers, place))
             except InputError as error:
-                rows.faults.setdefault(column, error)
+                rows.faults[column] = error
     return rows
 
 

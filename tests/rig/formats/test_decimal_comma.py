@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from capsule_id.importing import propose_entry
+from capsule_id.rig.formats import raw
 from tests.rig.test_column_maps import DISP, TIME, assert_read, fault_of, rig_of, rows
 
 
@@ -118,6 +119,16 @@ def test_whole_numbers_above_all_decimals_show_thousands(tmp_path: Path, decimal
     plain = "".join(f"{k}\t{42501 - 7 * k:,}\n".replace(",", decimal) for k in range(60))
     (table,) = rig_of(tmp_path, {"x.txt": plain}, lines).tables
     assert table["x_rel"][0] == pytest.approx(0.042501)
+
+
+def test_an_ambiguous_column_is_named_where_later_blocks_show_no_mark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before: an internal failure at the first block of whole numbers."""
+    monkeypatch.setattr(raw, "BLOCK", 300)
+    text = "".join(f"{k / 8:.3f};{f'1.{k:03}' if k < 60 else '1'}\n".replace(".", ",", 1) for k in range(200))
+    fault = fault_of(tmp_path, {"x.csv": text}, f'file = "x.csv"\n{MAP_BY_NUMBER}')
+    assert (fault.line, fault.value) == (1, "'1.000'")
 
 
 def test_the_points_of_a_date_are_no_decimal_marks(tmp_path: Path) -> None:
