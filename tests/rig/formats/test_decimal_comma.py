@@ -104,7 +104,7 @@ def test_a_lone_mark_before_three_digits_is_ambiguous(tmp_path: Path, decimal: s
 
 @pytest.mark.parametrize(("decimal", "other"), [(",", "."), (".", ",")])
 def test_whole_numbers_above_all_decimals_show_thousands(tmp_path: Path, decimal: str, other: str) -> None:
-    """Before: 2.501 beside -930 in one column was 2.501, and nothing said so. Control: 42.501 alone is a decimal."""
+    """Before: 2.501 beside -930 in one column was 2.501, and nothing said so. Control: 42.501 beside 42 is a decimal."""
     lines = f'file = "x.txt"\n{MAP_BY_NUMBER}'
     whole = np.round(2500 * np.cos(0.2 * np.arange(200)))
     text = "".join(f"{k}\t{x:,.0f}\n".replace(",", other) for k, x in enumerate(whole))
@@ -117,8 +117,8 @@ def test_whole_numbers_above_all_decimals_show_thousands(tmp_path: Path, decimal
         (table,) = rig_of(tmp_path, {"x.txt": few.replace("500\t0\n", "")}, f"{lines}\n{stated}").tables
         assert table["time"][0] == pytest.approx(time)
     plain = "".join(f"{k}\t{42501 - 7 * k:,}\n".replace(",", decimal) for k in range(60))
-    (table,) = rig_of(tmp_path, {"x.txt": plain}, lines).tables
-    assert table["x_rel"][0] == pytest.approx(0.042501)
+    (table,) = rig_of(tmp_path, {"x.txt": f"{plain}60\t42\n"}, lines).tables
+    np.testing.assert_allclose(table["x_rel"][[0, -1]], [0.042501, 0.042])
 
 
 def test_an_ambiguous_column_is_named_where_later_blocks_show_no_mark(
