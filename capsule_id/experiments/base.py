@@ -7,10 +7,10 @@ from types import ModuleType
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
-from scipy.linalg import block_diag
+from scipy import linalg, stats
 from scipy.optimize import least_squares
 
 from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
@@ -255,14 +255,15 @@ class Experiment(eqx.Module):
         """Misfits for the likelihood alone: moments where they are sufficient."""
         return tuple(misfit.summary(xp) for misfit in self.misfits(theta, xp))
 
-    def misfit(self, theta: ValuesBySymbol) -> ScaledMisfit:
-        """Misfit of all groups together at the scatters of ``theta``, NumPy."""
-        parts = self.scaled(theta, np)
+    def misfit(self, theta: ValuesBySymbol, xp: ModuleType = np) -> ScaledMisfit:
+        """Misfit of all groups together at the scatters of ``theta``."""
+        parts = self.scaled(theta, xp)
+        diagonal = linalg.block_diag if xp is np else jax.scipy.linalg.block_diag
         return ScaledMisfit(
-            np.concatenate([part.raw for part in parts]),
-            np.concatenate([part.sd for part in parts]),
-            block_diag(*(part.design for part in parts)),
-            np.concatenate([part.log_measure for part in parts]),
+            xp.concatenate([part.raw for part in parts]),
+            xp.concatenate([part.sd for part in parts]),
+            diagonal(*(part.design for part in parts)),
+            xp.concatenate([part.log_measure for part in parts]),
         )
 
     def scaled(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> list[ScaledMisfit]:
@@ -302,15 +303,15 @@ class Experiment(eqx.Module):
         """(p,) conditional mean of the linear nuisances, in units of their priors."""
         return self.misfit(theta).at_nuisance_mean(np)[1]
 
-    @property
-    def blocks(self) -> np.ndarray:
-        """(blocks,) first reading of every term of the leave-one-out density: a row, of a record or a long table a stretch."""
-        count = min(self.n, BLOCKS if self.time_series else MOST_TERMS)
-        return np.arange(count) * self.n // count
+    def blocks(self, n: int) -> np.ndarray:
+        """(blocks,) first of ``n`` readings of every leave-one-out term: a row, of a record or a long table a stretch."""
+        count = min(n, BLOCKS if self.time_series else MOST_TERMS)
+        return np.arange(count) * n // count
 
-    def left_out(self, theta: ValuesBySymbol) -> np.ndarray:
+    def left_out(self, theta: ValuesBySymbol, xp: ModuleType = np) -> Any:
         """Log-density (blocks,) of each of ``blocks`` given all other readings; coloured noise: as innovations."""
-        return self.misfit(theta).left_out(self.blocks)
+        misfit = self.misfit(theta, xp)
+        return misfit.left_out(self.blocks(len(misfit.raw)), xp)
 
     def replicate(self, theta: ValuesBySymbol, rng: np.random.Generator) -> np.ndarray:
         """Replicate (n,) of the readings, SI, given one draw of the nuisances; coloured noise: and given the past."""

@@ -139,21 +139,27 @@ class ScaledMisfit:
             raw = raw - self.design @ conditional_draw(ay, aa, rng)
         return raw / self.sd
 
-    def left_out(self, first: np.ndarray) -> np.ndarray:
+    def left_out(self, first: np.ndarray, xp: ModuleType = jnp) -> Any:
         """(blocks,) log-density of each block of readings given all others, nuisances integrated out.
 
         ``first`` (blocks,) holds the first reading of every block. The terms of ``arviz.loo`` (P.-C. Bürkner, J. Gabry,
         A. Vehtari, *Efficient leave-one-out cross-validation for Bayesian non-factorized normal and Student-t models*,
         Computational Statistics 36, 2021, 1243).
         """
-        y, a = self.raw / self.sd, self.design / self.sd[:, None]
-        size = np.diff(np.append(first, len(y)))
-        yy, ay = np.add.reduceat(y**2, first), np.add.reduceat(a * y[:, None], first)
-        aa = np.add.reduceat(a[:, :, None] * a[:, None, :], first)
-        whole = marginal_log_density(np.sum(yy), np.sum(ay, axis=0), np.sum(aa, axis=0), len(y), np)
-        others = _sum_of_others(yy), _sum_of_others(ay), _sum_of_others(aa)
-        rest = marginal_log_density(*others, len(y) - size, np)
-        return whole - rest + np.add.reduceat(self.log_measure - np.log(self.sd), first)
+        rows = xp.concatenate([self.raw[:, None], self.design], axis=1) / self.sd[:, None]
+        size = np.diff(np.append(first, len(rows)))
+        within = np.arange(np.max(size)) < size[:, None]
+
+        def by_block(terms: Any) -> Any:
+            """(blocks, longest, ...) of (n, ...); zeros behind the end of a block."""
+            index = xp.minimum(first[:, None] + xp.arange(within.shape[1]), len(terms) - 1)
+            return xp.where(within.reshape(*within.shape, *(1,) * (terms.ndim - 1)), terms[index], 0.0)
+
+        y, a = (part := by_block(rows))[..., 0], part[..., 1:]
+        yy, ay, aa = (y**2).sum(-1), (y[..., None] * a).sum(-2), a.swapaxes(-1, -2) @ a
+        whole = marginal_log_density(xp.sum(yy), xp.sum(ay, axis=0), xp.sum(aa, axis=0), len(rows), xp)
+        rest = marginal_log_density(*(_sum_of_others(part, xp) for part in (yy, ay, aa)), len(rows) - size, xp)
+        return whole - rest + xp.sum(by_block(self.log_measure - xp.log(self.sd)), axis=1)
 
 
 @dataclass(frozen=True)
@@ -260,11 +266,11 @@ class Misfit:
         return self.at(scatter, xp).log_density(xp)
 
 
-def _sum_of_others(parts: np.ndarray) -> np.ndarray:
+def _sum_of_others(parts: Any, xp: ModuleType) -> Any:
     """Sum over the first axis of ``parts`` (m, ...) without each part in turn; a difference would lose digits."""
-    nothing = np.zeros_like(parts[:1])
-    before = np.concatenate([nothing, np.cumsum(parts[:-1], axis=0)])
-    return before + np.concatenate([np.cumsum(parts[:0:-1], axis=0)[::-1], nothing])
+    nothing = xp.zeros_like(parts[:1])
+    before = xp.concatenate([nothing, xp.cumsum(parts[:-1], axis=0)])
+    return before + xp.concatenate([xp.cumsum(parts[:0:-1], axis=0)[::-1], nothing])
 
 
 def _variance(fixed: Any, scale: Any, scatter: Any) -> Any:

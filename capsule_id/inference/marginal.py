@@ -14,13 +14,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import wrightomega
 
+from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.curvature import require_width
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import HEAVY, LogPosterior, Scale, half_ensemble
-from capsule_id.physics.batches import in_batches
+from capsule_id.physics.batches import in_batches, pool
 from capsule_id.precision import COMPILE
 
 # quadrature: Quadrature nodes of the integrals over scatters.
@@ -485,6 +486,42 @@ def _conditional(
     if rows:
         terms = terms + _sum_by(jnp.concatenate(rows), row_scatter, len(scatter))
     return parts, terms, jnp.log(step) + jax.nn.logsumexp(terms, axis=-1)
+
+
+def left_out(target: LogPosterior, theta: Float[np.ndarray, "w d"]) -> list[np.ndarray]:
+    """Terms (w, blocks) of the leave-one-out density of every experiment at constrained values (w, d)."""
+
+    def of_rows(rows: np.ndarray) -> np.ndarray:
+        stop_if_interrupted()
+        return np.asarray(_left_out(target, rows))
+
+    quick = [e for e in target.experiments if not e.event_driven]
+    ends = np.cumsum([len(e.blocks(e.n)) for e in quick])
+    rows = iter(np.split(in_batches(of_rows, theta, rows_of(target)), ends[:-1], axis=1) if quick else ())
+    values = [target.mapping(row) for row in theta] if len(quick) < len(target.experiments) else []
+
+    def of_motions(e: Experiment) -> np.ndarray:
+        stop_if_interrupted()
+        # A motion takes milliseconds, and minutes to compile once more.
+        return np.stack(list(pool().map(lambda own: e.left_out(e.local(own)), values)))
+
+    return [of_motions(e) if e.event_driven else next(rows) for e in target.experiments]
+
+
+@partial(jax.jit, compiler_options=COMPILE)
+def _left_out(target: LogPosterior, theta: Any) -> Any:
+    """(w, terms) of the experiments without motions, in their order."""
+
+    def of_row(values: Any) -> Any:
+        found = {}
+        for group in target.groups:
+            if not group.experiments.event_driven:
+                own = group.local(values) | {n: jnp.full(len(group.members), x) for n, x in target.constants.items()}
+                terms = jax.vmap(lambda e, own: e.left_out(own, jnp))(group.experiments, own)
+                found |= zip(group.members, terms, strict=True)
+        return jnp.concatenate([found[i] for i in sorted(found)])
+
+    return jax.lax.map(of_row, theta, batch_size=ROWS_TOGETHER)
 
 
 def _sum_by(values: Any, label: Sequence[int], number: int) -> Any:

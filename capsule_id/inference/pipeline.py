@@ -17,7 +17,6 @@
 
 import platform
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -32,7 +31,7 @@ from capsule_id.experiments.kind import Choice, Registry, compare, select_tables
 from capsule_id.experiments.lint import lint
 from capsule_id.inference.checks.posterior import check_agreement, decisive_readings
 from capsule_id.inference.checks.verdict import model_errors, run_checks, with_scaled
-from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.marginal import MarginalPosterior, left_out
 from capsule_id.inference.point_fit import point_fit_again
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
@@ -247,24 +246,17 @@ def _pointwise(target: LogPosterior, posterior: Posterior, rng: np.random.Genera
     readings = sum(e.n for e in target.experiments)
     thin = max(2, round((len(chain) * len(draw) * readings / REPLICATES) ** 0.5))
     by_chain = posterior.draws.transpose(0, 2, 1, 3).reshape(ensembles * walkers, draws, d)[np.ix_(chain, draw)]
-    values = [target.mapping(theta) for theta in by_chain.reshape(-1, d)]
     some = [target.mapping(theta) for theta in by_chain[::thin, ::thin].reshape(-1, d)]
     coarse = by_chain[::thin, ::thin].shape[:2]
     density, replicates = {}, {}
-    for e in target.experiments:
+    for e, terms in zip(target.experiments, left_out(target, by_chain.reshape(-1, d)), strict=True):
         stop_if_interrupted()
-        local = [e.local(v) for v in values]
-        if e.event_driven:  # a motion takes milliseconds of compiled code; short calls would wait for each other
-            with ThreadPoolExecutor() as pool:
-                terms = list(pool.map(e.left_out, local))
-        else:
-            terms = [e.left_out(v) for v in local]
         density[e.label] = _rounded(np.reshape(terms, (len(chain), len(draw), -1)), DENSITY_STEP)
         made = np.reshape([e.replicate(e.local(v), rng) for v in some], (*coarse, e.n))
         sd = np.std(made, axis=(0, 1))
         # A reading that never varies, as of a single replicate, stays.
         replicates[e.label] = np.where(sd > 0.0, _rounded(made, REPLICATE_STEP * np.where(sd > 0.0, sd, 1.0)), made)
-    return Pointwise(density, {e.label: e.blocks for e in target.experiments}, replicates, chain, draw, thin)
+    return Pointwise(density, {e.label: e.blocks(e.n) for e in target.experiments}, replicates, chain, draw, thin)
 
 
 def _rounded(values: np.ndarray, step: float | np.ndarray) -> np.ndarray:
