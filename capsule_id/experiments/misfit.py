@@ -152,13 +152,14 @@ class ScaledMisfit:
 
         def by_block(terms: Any) -> Any:
             """(blocks, longest, ...) of (n, ...); zeros behind the end of a block."""
-            index = xp.minimum(first[:, None] + xp.arange(within.shape[1]), len(terms) - 1)
+            index = xp.minimum(first[:, None] + xp.arange(within.shape[1])[None], len(terms) - 1)
             return xp.where(within.reshape(*within.shape, *(1,) * (terms.ndim - 1)), terms[index], 0.0)
 
         y, a = (part := by_block(rows))[..., 0], part[..., 1:]
         yy, ay, aa = (y**2).sum(-1), (y[..., None] * a).sum(-2), a.swapaxes(-1, -2) @ a
         whole = marginal_log_density(xp.sum(yy), xp.sum(ay, axis=0), xp.sum(aa, axis=0), len(rows), xp)
-        rest = marginal_log_density(*(_sum_of_others(part, xp) for part in (yy, ay, aa)), len(rows) - size, xp)
+        other_yy, other_ay, other_aa = (_sum_of_others(part, xp) for part in (yy, ay, aa))
+        rest = marginal_log_density(other_yy, other_ay, other_aa, len(rows) - size, xp)
         return whole - rest + xp.sum(by_block(self.log_measure - xp.log(self.sd)), axis=1)
 
 

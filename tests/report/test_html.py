@@ -105,6 +105,13 @@ def test_a_cloud_of_points_is_not_written_as_svg_first(monkeypatch: pytest.Monke
         patched.setattr(Figure, "savefig", None)
         assert svg(figure_of(cloud), 60_000) == b""
     assert len(svg(figure_of(cloud), 1_000_000)) > 40 * len(points)
+    # The contours of a corner plot are such a cloud too.
+    area = new_axes()
+    area.fill_between(points, points**2)
+    with monkeypatch.context() as patched:
+        patched.setattr(Figure, "savefig", None)
+        assert svg(figure_of(area), 60_000) == b""
+    assert svg(figure_of(area), 1_000_000)
 
 
 def test_lines_are_svg_in_the_colours_of_the_page_and_load_nothing(page: str, drawn: tuple[Picture, ...]) -> None:

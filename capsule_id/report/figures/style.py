@@ -12,6 +12,7 @@ from matplotlib import rc_context, rcParamsDefault
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import Collection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 from matplotlib.lines import Line2D
@@ -159,7 +160,10 @@ def svg(figure: Figure, most: int) -> bytes:
     This is the rule of every picture of the page: SVG for lines, PNG for clouds of points.
     """
     lines = (line for line in figure.findobj(Line2D) if line.get_marker() not in ("None", "", " ", None))
-    if _MARKER * sum(np.size(line.get_xdata()) for line in lines) > _LARGEST_SVG * most:
+    areas = (path for many in figure.findobj(Collection) for path in cast(Collection, many).get_paths())
+    # A vertex of an area takes half the bytes of a marker.
+    points = sum(np.size(line.get_xdata()) for line in lines) + sum(len(path) for path in areas) / 2
+    if _MARKER * points > _LARGEST_SVG * most:
         return b""
     buffer = io.StringIO()
     with warnings.catch_warnings(), rc_context({"svg.fonttype": "none", "svg.hashsalt": "capsule-id"}):
