@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
+import capsule_id as cid
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.capsule_experiment import CapsuleDecay, CapsuleForward, CapsulePushes
 from capsule_id.experiments.dynamic_friction import DynamicFriction
@@ -95,6 +96,23 @@ def test_a_large_release_biases_the_closed_form_only() -> None:
         assert abs(value - truth) < 3.5 * sd
     closed, sd = estimate(fitted(5e-3, "closed"), "c")
     assert abs(closed - bench.C) > 5.0 * sd
+
+
+@pytest.mark.parametrize(
+    ("release", "doubted"), [(6e-3, {"c", "c_q", "k_cubic"}), pytest.param(2e-3, set(), marks=pytest.mark.full)]
+)
+def test_a_slip_that_looks_like_a_further_force_is_named(release: float, doubted: set[str]) -> None:
+    """The capsule counts as held, and tilts give mu. (Before: c 6 sd off, and a quadratic damping, both trusted.)"""
+    table = decay(release, "closed")
+    table = replace(table, settings=replace(table.settings, capsule="held"))
+    tilts = bench.table(
+        "static_friction", [bench.column("angle", np.arctan(MU) + 0.005 * np.array([-1.0, 0.0, 1.0, 0.5]))]
+    )
+    result = cid.fit(bench.rig(table, tilts), budget=None)
+    found = {name for finding in result.findings if finding.code == "decays.slip" for name in finding.parameters}
+    assert found == doubted
+    assert all(result[name].trust != "trusted" for name in doubted)
+    assert (found == set()) == (abs(result["c"].value - bench.C) < 3.0 * result["c"].sd)
 
 
 @pytest.mark.full

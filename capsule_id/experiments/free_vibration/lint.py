@@ -513,6 +513,11 @@ MESSAGES = {
     ),
     "decays.slip": Message(
         "free decay",
+        warn=(
+            "{label}: the rod pushes with {force:.3g} N, more than friction holds, F_b = {F_b:.3g} N. A capsule that is not "
+            "held slips then, and that looks like the further force found here. If it was held, state the words of damping "
+            "and stiffness that the second fit names; else hold it, or release from a smaller deflection."
+        ),
         fail=(
             "expected a free capsule at rest, |f| <= F_b = {F_b:.3g} N; the record reaches {force:.3g} N, so the capsule "
             "slips and this is no free decay. Hold the capsule, or release from a smaller deflection."
