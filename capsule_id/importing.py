@@ -17,7 +17,7 @@ from capsule_id.records.release import find_free_decay, find_releases
 from capsule_id.records.tones import estimate_clock, frequency_of
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats.layouts import delimiter_of
-from capsule_id.rig.formats.raw import TextFile
+from capsule_id.rig.formats.raw import NO_READING, TextFile
 from capsule_id.rig.guess import (
     TIME,
     Assignment,
@@ -376,7 +376,7 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
         _commented(line, "unsure" if UNKNOWN in line else "likely", why) for line, why in lines_of_labels(found, kind)
     ]
     lines += _setting_lines(found, guessed, kind)
-    lines += ["[experiment.columns]", *_column_lines(found, guessed, kind)]
+    lines += _column_lines(found, guessed, kind)
     return "\n".join(lines) + "\n"
 
 
@@ -403,8 +403,8 @@ def _unused_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
     weighed = [(i, unit_of(found.header(i, ["kg"])[1], ["kg"])) for i in found.columns if i not in used]
     index, unit = next(((i, unit) for i, unit in weighed if unit in ("kg", "g", "lb")), (0, None))
     if unit and "normal_force" in kind.optional and "normal_force" not in guessed.columns:
-        source = f'normal_force = {{ from = {source_of(found, index)}, unit = "{unit}f" }}'
-        yield f"#: If {found.names[index]!r} is the mass that presses on the track, add to the columns: {source}"
+        source = f'columns.normal_force = {{ from = {source_of(found, index)}, unit = "{unit}f" }}'
+        yield f"#: If {found.names[index]!r} is the mass that presses on the track, add: {source}"
 
 
 def _commented(line: str, confidence: str, reason: str) -> str:
@@ -425,6 +425,7 @@ def _layout_lines(found: FoundLayout) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
     used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
     label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{found.export.path.stem}_{used.sheet}") if used.sheet else None
+    codes = [text for text in used.missing if text not in NO_READING]
     longest = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
     # A record that a line of text interrupts is no record and a footer.
     parted = sorted(last - first for first, last in found.blocks)[-2:-1] > [FEWEST_SAMPLES]
@@ -436,6 +437,7 @@ def _layout_lines(found: FoundLayout) -> Iterable[str]:
             "unsure" if parted else "likely",
             f"{longest}; the others are not read" if len(found.blocks) > 1 else "the last row of readings",
         ),
+        ("missing", codes or None, "likely", "far from all other numbers of their column: codes for no reading"),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),
         ("sheet", used.sheet, "sure", "several sheets hold numbers, each has an entry"),
         ("label", label, "sure", "names of experiments differ"),
@@ -513,10 +515,10 @@ def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
         rate, confidence, reason = f'"{UNKNOWN}"', "unsure", "the file states no rate"
         if guessed.rate is not None:
             rate, confidence, reason = f"{guessed.rate:g}", "likely", "the file states this rate and no times"
-        yield _commented(f'{TIME} = {{ rate = {{ value = {rate}, unit = "Hz" }} }}', confidence, reason)
+        yield _commented(f'columns.{TIME} = {{ rate = {{ value = {rate}, unit = "Hz" }} }}', confidence, reason)
     for index in times_of_trace(found, kind)[:1]:  # check refuses it: no sample of a trace may pass for a trial
         source = f'{{ from = {source_of(found, index)}, unit = "{unit_of(found.header(index, ["s"])[1], ["s"]) or UNKNOWN}" }}'
-        yield _commented(f"{TIME} = {source}", "unsure", f"a record in time: read the trials of {kind.name} off it")
+        yield _commented(f"columns.{TIME} = {source}", "unsure", f"a record in time: read the trials of {kind.name} off it")
     for name, column in guessed.columns.items():
         for each in (column, *column.rivals):
             factor = "" if each.scale is None else f", scale = {each.scale:.10g}"
@@ -524,7 +526,7 @@ def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
             unit = signal if each.unit == UNKNOWN and signal in SIGNALS else each.unit
             source = f'{{ from = {source_of(found, each.index)}, unit = "{unit}"{factor} }}'
             reason = column.reason if each is column else "or this one"
-            yield _commented(f"{'# ' * column.asked}{name} = {source}", column.confidence, reason)
+            yield _commented(f"{'# ' * column.asked}columns.{name} = {source}", column.confidence, reason)
 
 
 # report: Describes an export before it is used: channels, units, sampling, gaps, clipping, drop-outs, first and last

@@ -6,6 +6,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from itertools import chain, groupby, pairwise, product, takewhile
 from pathlib import Path
 from typing import Literal
@@ -14,9 +15,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from capsule_id.errors import InputError, printable
+from capsule_id.parameters import ROUNDING
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
-from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
+from capsule_id.rig.formats.layouts import delimiter_of, is_number, is_wanted, split_bare
 from capsule_id.rig.formats.raw import (
     COMPRESSED,
     NO_READING,
@@ -32,6 +34,7 @@ from capsule_id.rig.schema import KindRule
 from capsule_id.rig.times import evened
 from capsule_id.rig.toml import shown
 from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si, scale, symbol_named
+from capsule_id.views import counted
 
 # headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
 
@@ -282,6 +285,9 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
         first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
         layout = replace(layout, data_from_line=first, data_to_line=last)
         export, (columns, singles, unread) = read(layout)
+    if (others := without_no_readings(export, layout, columns)) != layout:
+        layout = others
+        export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
     numbers = tuple(index + 1 for index in unread)
@@ -446,6 +452,133 @@ def _rate(beginning: bytes, names: Sequence[str], singles: dict[int, float]) -> 
     return None
 
 
+# rows: Finds what stands among readings and is none: rows of statistics, and values that stand for a missing reading.
+
+
+#: Words of the labels of rows of statistics, without accents, and words that may stand beside them.
+STATISTICS, BESIDE = (
+    frozenset(words.split())
+    for words in (
+        "mean average avg sd std stdev stddev sum total variance median mittelwert mittel durchschnitt summe gesamt "
+        "standardabweichung stabw stdabw varianz moyenne somme ecart ecarttype media promedio suma desviacion desvest "
+        "somma deviation deviazione scarto mediana mediane min max minimum maximum minimo massimo maximo",
+        "value values of the der aller de des di la standard dev estandar tipica type error fehler sem n s x",
+    )
+)
+#: Most rows of a table in which rows of statistics are looked for: a longer one is a record.
+MOST_TRIALS = 1000
+#: Largest probability that readings agree by chance with statistics of the rows above them; ratio for a number outside
+#: twice the range of those; most rows of statistics without a label, and fewest rows above them.
+CHANCE, OUTSIDE, MOST_BELOW, FEWEST_ABOVE = 1e-4, 1e-2, 4, 3
+#: Largest difference of a rounded number from the exact one, in units of its last digit, with a margin.
+HALF_DIGIT = 0.51
+#: Numbers that programs write for no reading, and the size from which no reading of a rig is.
+_NO_READING = re.compile(r"-?(?:9{3,}(?:\.(?:9+|25))?|9{2,}\.9+)|32767|-32768|65535|2147483647|-2147483648")
+BEYOND = 1e30
+#: Distance of such a number from all others, in ranges of those: of one alone, and of one that is repeated.
+FAR_ALONE, FAR = 10.0, 1.0
+
+
+def code_in(values: np.ndarray) -> float | None:
+    """The number in a column, (n,), that stands for no reading, far from all others; None without one."""
+    finite = values[np.isfinite(values)]
+    for end in (float(finite.min()), float(finite.max())) if finite.size > 2 else ():
+        rest = finite[finite != end]
+        if abs(end) >= BEYOND:
+            return end
+        if rest.size > 1 and _NO_READING.fullmatch(f"{end:.7g}"):
+            far = FAR_ALONE if finite.size - rest.size == 1 else FAR
+            if np.min(np.abs([rest.min() - end, rest.max() - end])) > far * np.ptp(rest):
+                return end
+    return None
+
+
+def is_statistic(cell: str) -> bool:
+    """Whether a cell is the label of a row of statistics, such as ``Mean`` or ``Standard deviation:``."""
+    words = {*_bare(cell).split("_")} - {""}
+    return bool(words & STATISTICS) and words <= STATISTICS | BESIDE
+
+
+def statistics_below(columns: Sequence[np.ndarray]) -> int:
+    """Number of last rows that are statistics of all rows above them in every column, (n,) each; 0 without such rows.
+
+    In each row one statistic agrees in all columns, to the digits written, where that is no chance.
+    """
+    table = np.column_stack(columns)
+    for rows in range(min(MOST_BELOW, len(table) - FEWEST_ABOVE), 0, -1):
+        here = table[:, np.isfinite(table[-rows:]).all(axis=0)]
+        above, below = here[:-rows][np.isfinite(here[:-rows]).all(axis=1)], here[-rows:]
+        if len(above) >= FEWEST_ABOVE and below.size and _by_chance(above, below) < CHANCE:
+            return rows
+    return 0
+
+
+def _by_chance(above: np.ndarray, below: np.ndarray) -> float:
+    """Probability that rows, (k, c), agree as they do with statistics of the rows above them, (n, c); 1 where they do not."""
+    spread = np.std(above, axis=0, ddof=1)
+    ends = np.mean(above, axis=0), np.median(above, axis=0), np.min(above, axis=0), np.max(above, axis=0)
+    known = np.array([*ends, spread, np.std(above, axis=0), spread / np.sqrt(len(above)), np.sum(above, axis=0)])
+    steps = [[10.0 ** float(Decimal(repr(one)).as_tuple().exponent) for one in row] for row in below.tolist()]
+    near = np.maximum(HALF_DIGIT * np.array(steps), ROUNDING * np.abs(below))
+    agree = np.all(np.abs(below[:, None] - known) <= near[:, None], axis=2).any(axis=1)
+    # A density of the normal distribution; a number that stands above is one that was set.
+    share = np.where(spread > 0.0, np.minimum(near / np.maximum(spread, np.finfo(float).tiny), 1.0), 1.0)
+    share = np.where(np.any(below[:, None] == above, axis=1), 1.0, share)
+    apart = np.abs(below - np.mean(ends[2:], axis=0)) > 1.5 * np.ptp(above, axis=0)
+    return float(np.prod(share * np.where(apart & (spread > 0.0), OUTSIDE, 1.0))) if agree.all() else 1.0
+
+
+def statistics_rows(export: Export, layout: Layout, columns: Iterable[np.ndarray]) -> dict[int, str]:
+    """Rows of statistics -> their labels; "" of rows below all others that are known by their numbers in ``columns``.
+
+    Where ``data_to_line`` is stated, rows without a label are readings. Labels of all rows, or of rows that ``where``
+    selects, are none.
+    """
+    if export.cells is None or len(export.lines) > MOST_TRIALS:
+        return {}
+    kept = {k for k in range(export.width) if is_wanted(k, export.headers, layout.words)}
+    every = ([cell for k, cell in enumerate(cells) if k not in kept] for cells in export.cells())
+    labels = {row: label for row, cells in enumerate(every) for label in filter(is_statistic, cells)}
+    if labels and len(labels) < len(export.lines):
+        return labels
+    below = 0 if layout.data_to_line is not None else statistics_below([*columns])
+    return dict.fromkeys(range(len(export.lines) - below, len(export.lines)), "")
+
+
+def refuse_no_readings(export: Export, layout: Layout, columns: Sequence[int]) -> None:
+    """Refuse rows of statistics among those of a table, and codes of missing readings in its ``columns``.
+
+    Raises
+    ------
+    InputError
+        At the first one.
+    """
+    for column in columns:
+        if (code := code_in(values := export.values(column))) is not None:
+            found, marker = np.flatnonzero(values == code), repr(code).removesuffix(".0")
+            rule = "a number far from all others, which programs write for no reading, must be stated as missing"
+            remedy = f'add "{marker}" to missing = [...] to drop its rows, or correct the cells'
+            value = f"{marker} in {counted(len(found), 'row')}"
+            raise InputError(rule, value, remedy, *export.place(int(found[0]), column))
+    if rows := statistics_rows(export, layout, map(export.values, columns)):
+        before, known = min(rows), any(rows.values())
+        ends = before > 0 and len(rows) == len(export.lines) - before
+        remedy = f"state data_to_line = {export.lines[before - 1]}" if ends else "delete the row"
+        remedy += "" if known else f", or data_to_line = {export.lines[-1]} if these are readings"
+        value = shown(rows[before]) if known else "numbers that are statistics of the rows above"
+        raise InputError("a row of statistics must not be read as a trial", value, remedy, *export.place(before, 0))
+
+
+def without_no_readings(export: Export, layout: Layout, columns: Mapping[int, np.ndarray]) -> Layout:
+    """The layout that ends above rows of statistics, and states codes of missing readings in ``columns``."""
+    rows = statistics_rows(export, layout, columns.values())
+    before = min(rows, default=0)
+    ends = before > 0 and len(rows) == len(export.lines) - before
+    codes = {repr(code).removesuffix(".0") for values in columns.values() if (code := code_in(values)) is not None}
+    last = int(export.lines[before - 1]) if ends else layout.data_to_line
+    return replace(layout, data_to_line=last, missing=(*layout.missing, *sorted(codes)))
+
+
 # columns: Guesses which columns of a file are those of one kind, and their units; proposes a column map for error
 # lines.
 
@@ -605,9 +738,11 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     unit = unit_of(text, [rule.si]) if text else None
     constant = is_constant(found, index)
     named, meant = fits_name(stem, name), meaning(stem, name, kind.meant)
-    said = f"the file says {found.names[index]!r}"
+    said, missing = f"the file says {found.names[index]!r}", "the file states no unit"
     if (text and unit is None) or named < 0 or (constant and rule.varies):
         return None
+    if (below := unit_of(found.units[index], [rule.si])) not in (None, unit):
+        unit, missing = None, f"the header says {unit}, the row of units {below}"
     by_name = named + MEANT_SCORE * meant if named or name == "force" else 0.0
     if by_name <= 0.0 or meant < 0:
         other = (constant and name not in kind.optional) or not (unit or named) or rule.si == "1"
@@ -618,7 +753,7 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     if unit is None and rule.si == "1":
         return by_name, ColumnGuess(index, "1", "likely", "a number without unit")
     if unit is None:
-        return by_name, ColumnGuess(index, UNKNOWN, "unsure", "the file states no unit")
+        return by_name, ColumnGuess(index, UNKNOWN, "unsure", missing)
     reason = said if unit == text else f"{said}, read as {unit}"
     return by_name + UNIT_SCORE, ColumnGuess(index, unit, "likely" if unit == "g_n" else "sure", reason)
 

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, islice, takewhile
+from itertools import chain, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from capsule_id.rig.formats.raw import (
     Layout,
     Place,
     TextFile,
+    numbers_of,
     refuse_line,
     refuse_wide,
 )
@@ -25,8 +26,6 @@ from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Shape,
-    apart_marks,
-    are_words,
     bare,
     cells_of,
     is_comment,
@@ -35,6 +34,7 @@ from capsule_id.rig.formats.text import (
     number_in,
     place_of_cell,
     rows_of,
+    shows_thousands,
     texts_of,
 )
 from capsule_id.rig.toml import shown
@@ -90,12 +90,8 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
-    first_rows = (
-        texts_of(line, delimiter) for line in islice(filter(is_row, file.lines(first)), 1 + 2 * MOST_TITLES // width)
-    )
-    columns = zip(*(cells for cells in first_rows if len(cells) >= width), strict=False)
     # The reader in C takes every mark for the decimal one.
-    quick = are_words(layout.missing) and (decimal is not None or not apart_marks([*columns], layout.missing, None))
+    quick = not numbers_of(layout.missing) and (decimal is not None or not shows_thousands(file, shape, layout.missing))
     rows = rows_of(file, shape, wanted, None, words) if quick else None
     stated = decimal is not None and layout.decimal == decimal
     rows = rows or rows_of(file, replace(shape, decimal=decimal, stated=stated), wanted, layout.missing, words)
@@ -106,7 +102,10 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    return Export(path, headers, width, lines, rows.column, place, file.encoding, rows.words)
+    def cells_of_rows() -> Iterator[list[str]]:
+        return (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
+
+    return Export(path, headers, width, lines, rows.column, place, file.encoding, rows.words, cells=cells_of_rows)
 
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
@@ -402,13 +401,21 @@ def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segmen
         keys, first = header(stop, number), number + 2
         segments.append(_Segment(keys, tuple(found), first, stop := first + len([*rows])))
     names = {segment.names for segment in segments}
+    labels = {" ".join(segment.keys.get("Y_Unit_Label", ())).strip(): segment.first for segment in segments}
+    units = {text: number for text, number in labels.items() if text}
     for holds, rule, number in (
         (end, f"a .lvm file must have a header that ends with {_END}", 1),
         *((one.stop > one.first, "a segment must have rows", one.first) for one in segments),
         (len(names) < 2, "segments must have the same columns", stop),
+        (
+            len(units) < 2,
+            f"segments must have the same units, not {' and '.join(units)}",
+            max(labels.values(), default=1),
+        ),
         (not header(stop, len(lines)), f"a header must end with {_END}", stop + 1),
         (min(map(len, names), default=0) > 1, "a LabVIEW measurement file must have a segment with channels", stop),
     ):
         if not holds:
-            raise InputError(rule, shown(lines[number - 1]), _REMEDY, text.path, number, 1)
+            remedy = "export a file of each segment" if rule.startswith("segments") else _REMEDY
+            raise InputError(rule, shown(lines[number - 1]), remedy, text.path, number, 1)
     return separator, header(0, end), segments

@@ -9,12 +9,22 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import date
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import NO_READING, Place, RawTable, TextFile, lines_of, refuse_wide
+from capsule_id.rig.formats.raw import (
+    MOST_TITLES,
+    NO_READING,
+    Place,
+    RawTable,
+    TextFile,
+    lines_of,
+    numbers_of,
+    refuse_wide,
+)
 from capsule_id.rig.toml import shown
 from capsule_id.views import counted
 
@@ -340,11 +350,6 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     return values[:, np.searchsorted(used, columns)] if exact else None
 
 
-def are_words(missing: Sequence[str]) -> bool:
-    """Whether no missing marker is a number, such as -999: the reader in C would take it for a reading."""
-    return all(number_in(marker, mark) is None for marker in missing for mark in ".,")
-
-
 def rows_of(
     file: TextFile,
     shape: Shape,
@@ -362,8 +367,8 @@ def rows_of(
         If a row has another number of cells than the first one.
     """
     rows = Rows({column: [] for column in columns}, {column: [] for column in words})
-    markers, marks = missing or (), dict.fromkeys(columns, shape.decimal)
-    alone, apart = not words and are_words(markers), None
+    markers, marks, codes = missing or (), dict.fromkeys(columns, shape.decimal), numbers_of(missing or ())
+    alone, apart = not words and not codes, None  # the reader in C would take a code for a reading
     for number, block in file.blocks(shape.first):
         # No other decimal mark than that of the reader in C can be meant.
         plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
@@ -400,7 +405,8 @@ def rows_of(
             try:
                 if mark is None:
                     raise _ambiguous(texts, turned, place)
-                rows.numbers[column].append(read_column(texts, marks[column] or ".", markers, place))
+                found = read_column(texts, marks[column] or ".", markers, place)
+                rows.numbers[column].append(np.where(np.isin(found, codes), np.nan, found) if codes else found)
             except InputError as error:
                 rows.faults[column] = error
     return rows
@@ -447,6 +453,13 @@ def apart_marks(columns: Sequence[Sequence[str]], missing: Sequence[str], decima
     return {
         k: marks[k] if sure else None for k, sure in lone.items() if sure is not False or others == {*",."} - {marks[k]}
     }
+
+
+def shows_thousands(file: TextFile, shape: Shape, missing: Sequence[str]) -> bool:
+    """Whether the first rows have a mark that may stand between thousands, as ``apart_marks`` says."""
+    lines = islice(filter(is_row, file.lines(shape.first)), 1 + 2 * MOST_TITLES // shape.width)
+    rows = (cells for line in lines if len(cells := texts_of(line, shape.delimiter)) >= shape.width)
+    return bool(apart_marks([*zip(*rows, strict=False)], missing, None))
 
 
 def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
@@ -500,12 +513,14 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     if not header.strip():
         empty = ("a table must not be empty", "no text at all", f"{_HEAD} and write a row per reading")
         raise InputError(*(_BLANK if any(line.strip() for line in file.lines()) else empty), path, 1, 1)
-    delimiter = next((mark for mark in "\t;," if mark in header), ",")
+    delimiter = _delimiter(header)
     refuse_wide(header.count(delimiter) + 1, path, 1)
     names, units = _header(header, delimiter, path)
     marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")
     shape = Shape(1, delimiter, len(names), decimal)
+    if delimiter != "," and shows_thousands(file, shape, NO_READING):  # the first mark may be none of a decimal
+        shape = replace(shape, decimal=None)
     quoted = [
         (cell, number + k + 1, column)
         for number, block in file.blocks(1)
@@ -532,6 +547,17 @@ def read_csv(content: bytes, path: Path) -> RawTable:
         raise InputError("a cell must not be empty", "nothing", remedy, *here)
     lost = np.sort(np.append(lines[missing], empty).astype(int))
     return replace(raw.taken(np.flatnonzero(~missing)), lost=lost) if len(lost) else raw
+
+
+def columns_of(content: bytes, path: Path) -> str:
+    """The column map ``columns = { ... }`` that reads a CSV table, by its headers ``name [unit]``."""
+    header = TextFile(content, path).line(0)
+    columns = enumerate(zip(*_header(header, _delimiter(header), path), strict=True), 1)
+    return f"columns = {{ {', '.join(f'{name} = {{ from = {k}, unit = "{unit}" }}' for k, (name, unit) in columns)} }}"
+
+
+def _delimiter(header: str) -> str:
+    return next((mark for mark in "\t;," if mark in header), ",")
 
 
 def _lines_without_cells(file: TextFile, rows: np.ndarray) -> list[int]:
