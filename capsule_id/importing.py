@@ -518,7 +518,9 @@ def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
         yield _commented(f'columns.{TIME} = {{ rate = {{ value = {rate}, unit = "Hz" }} }}', confidence, reason)
     for index in times_of_trace(found, kind)[:1]:  # check refuses it: no sample of a trace may pass for a trial
         source = f'{{ from = {source_of(found, index)}, unit = "{unit_of(found.header(index, ["s"])[1], ["s"]) or UNKNOWN}" }}'
-        yield _commented(f"columns.{TIME} = {source}", "unsure", f"a record in time: read the trials of {kind.name} off it")
+        yield _commented(
+            f"columns.{TIME} = {source}", "unsure", f"a record in time: read the trials of {kind.name} off it"
+        )
     for name, column in guessed.columns.items():
         for each in (column, *column.rivals):
             factor = "" if each.scale is None else f", scale = {each.scale:.10g}"

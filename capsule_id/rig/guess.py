@@ -285,8 +285,8 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
         first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
         layout = replace(layout, data_from_line=first, data_to_line=last)
         export, (columns, singles, unread) = read(layout)
-    if (others := without_no_readings(export, layout, columns)) != layout:
-        layout = others
+    if (other := no_readings(export, layout, [*columns.values()])[1]) != layout:
+        layout = other
         export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
@@ -484,12 +484,10 @@ def code_in(values: np.ndarray) -> float | None:
     finite = values[np.isfinite(values)]
     for end in (float(finite.min()), float(finite.max())) if finite.size > 2 else ():
         rest = finite[finite != end]
-        if abs(end) >= BEYOND:
+        apart = FAR_ALONE if finite.size - rest.size == 1 else FAR
+        known = rest.size > 1 and _NO_READING.fullmatch(f"{end:.7g}")
+        if abs(end) >= BEYOND or (known and min(np.abs([rest.min() - end, rest.max() - end])) > apart * np.ptp(rest)):
             return end
-        if rest.size > 1 and _NO_READING.fullmatch(f"{end:.7g}"):
-            far = FAR_ALONE if finite.size - rest.size == 1 else FAR
-            if np.min(np.abs([rest.min() - end, rest.max() - end])) > far * np.ptp(rest):
-                return end
     return None
 
 
@@ -507,42 +505,47 @@ def statistics_below(columns: Sequence[np.ndarray]) -> int:
     table = np.column_stack(columns)
     for rows in range(min(MOST_BELOW, len(table) - FEWEST_ABOVE), 0, -1):
         here = table[:, np.isfinite(table[-rows:]).all(axis=0)]
-        above, below = here[:-rows][np.isfinite(here[:-rows]).all(axis=1)], here[-rows:]
-        if len(above) >= FEWEST_ABOVE and below.size and _by_chance(above, below) < CHANCE:
+        above = here[:-rows][np.isfinite(here[:-rows]).all(axis=1)]
+        if len(above) >= FEWEST_ABOVE and here.size and _by_chance(above, here[-rows:]) < CHANCE:
             return rows
     return 0
 
 
 def _by_chance(above: np.ndarray, below: np.ndarray) -> float:
     """Probability that rows, (k, c), agree as they do with statistics of the rows above them, (n, c); 1 where they do not."""
-    spread = np.std(above, axis=0, ddof=1)
-    ends = np.mean(above, axis=0), np.median(above, axis=0), np.min(above, axis=0), np.max(above, axis=0)
-    known = np.array([*ends, spread, np.std(above, axis=0), spread / np.sqrt(len(above)), np.sum(above, axis=0)])
-    steps = [[10.0 ** float(Decimal(repr(one)).as_tuple().exponent) for one in row] for row in below.tolist()]
-    near = np.maximum(HALF_DIGIT * np.array(steps), ROUNDING * np.abs(below))
-    agree = np.all(np.abs(below[:, None] - known) <= near[:, None], axis=2).any(axis=1)
-    # A density of the normal distribution; a number that stands above is one that was set.
-    share = np.where(spread > 0.0, np.minimum(near / np.maximum(spread, np.finfo(float).tiny), 1.0), 1.0)
-    share = np.where(np.any(below[:, None] == above, axis=1), 1.0, share)
-    apart = np.abs(below - np.mean(ends[2:], axis=0)) > 1.5 * np.ptp(above, axis=0)
-    return float(np.prod(share * np.where(apart & (spread > 0.0), OUTSIDE, 1.0))) if agree.all() else 1.0
+    mean, sds = np.mean(above, axis=0), [np.std(above, axis=0, ddof=k) for k in (1, 0)]
+    spread, known = sds[0], np.array([mean, np.median(above, axis=0), np.min(above, axis=0), np.max(above, axis=0), *sds,
+                                      sds[0] / np.sqrt(len(above)), np.sum(above, axis=0)])  # fmt: skip
+    steps = np.reshape(
+        [10.0 ** float(Decimal(repr(one)).as_tuple().exponent) for one in below.ravel().tolist()], below.shape
+    )
+    near = np.maximum(HALF_DIGIT * steps, ROUNDING * np.abs(below))
+    agree = np.all(np.abs(below[:, None] - known) <= near[:, None], axis=2).any(axis=1).all()
+    # By the density of a normal distribution. A number that stands above too, or in all rows, was set.
+    chance = np.minimum(near / np.maximum(spread, np.finfo(float).tiny), 1.0)
+    chance *= np.where(np.abs(below - 0.5 * (known[2] + known[3])) > 1.5 * np.ptp(above, axis=0), OUTSIDE, 1.0)
+    chance[(spread == 0.0) | np.any(below[:, None] == above, axis=1)] = 1.0
+    return float(np.prod(chance)) if agree else 1.0
 
 
-def statistics_rows(export: Export, layout: Layout, columns: Iterable[np.ndarray]) -> dict[int, str]:
-    """Rows of statistics -> their labels; "" of rows below all others that are known by their numbers in ``columns``.
+def no_readings(export: Export, layout: Layout, columns: Sequence[np.ndarray]) -> tuple[dict[int, str], Layout]:
+    """Rows of statistics -> their labels, and the layout that leaves them out and states codes of missing readings.
 
-    Where ``data_to_line`` is stated, rows without a label are readings. Labels of all rows, or of rows that ``where``
-    selects, are none.
+    ``columns`` are those that are read. Rows below all others are known by their numbers too, "", unless ``data_to_line``
+    is stated. Labels of all rows are none, nor are those that ``where`` selects.
     """
-    if export.cells is None or len(export.lines) > MOST_TRIALS:
-        return {}
-    kept = {k for k in range(export.width) if is_wanted(k, export.headers, layout.words)}
-    every = ([cell for k, cell in enumerate(cells) if k not in kept] for cells in export.cells())
-    labels = {row: label for row, cells in enumerate(every) for label in filter(is_statistic, cells)}
-    if labels and len(labels) < len(export.lines):
-        return labels
-    below = 0 if layout.data_to_line is not None else statistics_below([*columns])
-    return dict.fromkeys(range(len(export.lines) - below, len(export.lines)), "")
+    labels, codes = dict[int, str](), {repr(one).removesuffix(".0") for one in map(code_in, columns) if one is not None}
+    if export.cells is not None and len(export.lines) <= MOST_TRIALS:
+        kept = {k for k in range(export.width) if is_wanted(k, export.headers, layout.words)}
+        cells = ((row, cell) for row, each in enumerate(export.cells()) for k, cell in enumerate(each) if k not in kept)
+        labels = {row: cell for row, cell in cells if is_statistic(cell)}
+        if len(labels) in (0, len(export.lines)):
+            below = statistics_below(columns) if columns and layout.data_to_line is None else 0
+            labels = dict.fromkeys(range(len(export.lines) - below, len(export.lines)), "")
+    first = min(labels, default=0)
+    at_end = first > 0 and len(labels) == len(export.lines) - first
+    last = int(export.lines[first - 1]) if at_end else layout.data_to_line
+    return labels, replace(layout, data_to_line=last, missing=(*layout.missing, *sorted(codes)))
 
 
 def refuse_no_readings(export: Export, layout: Layout, columns: Sequence[int]) -> None:
@@ -553,30 +556,23 @@ def refuse_no_readings(export: Export, layout: Layout, columns: Sequence[int]) -
     InputError
         At the first one.
     """
-    for column in columns:
-        if (code := code_in(values := export.values(column))) is not None:
-            found, marker = np.flatnonzero(values == code), repr(code).removesuffix(".0")
-            rule = "a number far from all others, which programs write for no reading, must be stated as missing"
-            remedy = f'add "{marker}" to missing = [...] to drop its rows, or correct the cells'
-            value = f"{marker} in {counted(len(found), 'row')}"
-            raise InputError(rule, value, remedy, *export.place(int(found[0]), column))
-    if rows := statistics_rows(export, layout, map(export.values, columns)):
-        before, known = min(rows), any(rows.values())
-        ends = before > 0 and len(rows) == len(export.lines) - before
-        remedy = f"state data_to_line = {export.lines[before - 1]}" if ends else "delete the row"
-        remedy += "" if known else f", or data_to_line = {export.lines[-1]} if these are readings"
-        value = shown(rows[before]) if known else "numbers that are statistics of the rows above"
-        raise InputError("a row of statistics must not be read as a trial", value, remedy, *export.place(before, 0))
-
-
-def without_no_readings(export: Export, layout: Layout, columns: Mapping[int, np.ndarray]) -> Layout:
-    """The layout that ends above rows of statistics, and states codes of missing readings in ``columns``."""
-    rows = statistics_rows(export, layout, columns.values())
-    before = min(rows, default=0)
-    ends = before > 0 and len(rows) == len(export.lines) - before
-    codes = {repr(code).removesuffix(".0") for values in columns.values() if (code := code_in(values)) is not None}
-    last = int(export.lines[before - 1]) if ends else layout.data_to_line
-    return replace(layout, data_to_line=last, missing=(*layout.missing, *sorted(codes)))
+    numbers = [export.values(column) for column in columns]
+    labels, other = no_readings(export, layout, numbers)
+    for marker in other.missing[len(layout.missing) :]:
+        rows, k = next(
+            (rows, k)
+            for k, one in zip(columns, numbers, strict=True)
+            if len(rows := np.flatnonzero(one == float(marker)))
+        )
+        rule = "a number far from all others, which programs write for no reading, must be stated as missing"
+        remedy = f'add "{marker}" to missing = [...] to drop its rows, or correct the cells'
+        raise InputError(rule, f"{marker} in {counted(len(rows), 'row')}", remedy, *export.place(int(rows[0]), k))
+    for row, label in labels.items():
+        ends = f"state data_to_line = {other.data_to_line}"
+        either = f"{ends}, or data_to_line = {export.lines[-1]} if these are readings"
+        remedy = either if not label else ends if other != layout else "delete the row"
+        value = shown(label) if label else "numbers that are statistics of the rows above"
+        raise InputError("a row of statistics must not be read as a trial", value, remedy, *export.place(row, 0))
 
 
 # columns: Guesses which columns of a file are those of one kind, and their units; proposes a column map for error

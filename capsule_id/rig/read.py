@@ -19,8 +19,9 @@ from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import ROUNDING, TABLE_1, Parameter, Prior
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
+from capsule_id.rig.formats.layouts import units_of_header
 from capsule_id.rig.formats.raw import Export, Layout, RawTable, TextFile
-from capsule_id.rig.formats.text import columns_of, is_stamp
+from capsule_id.rig.formats.text import is_stamp
 from capsule_id.rig.guess import find_layout, fits_name, proposal, refuse_no_readings
 from capsule_id.rig.maps import (
     LAYOUT,
@@ -377,9 +378,9 @@ def read_tables(
         exports = {
             name: EXPORTS[suffix_of(file)](contents.pop(name), file, column_map.layout) for name, file in files.items()
         }
-        parts = apply_map(entry, list(exports.values()), column_map)
         for export in exports.values():
             refuse_no_readings(export, column_map.layout, column_map.numbers(export))
+        parts = apply_map(entry, list(exports.values()), column_map)
         encodings = {name: export.encoding for name, export in exports.items()}
         for name, export in exports.items():
             if "sheet" in entry and not export.sheet:
@@ -529,8 +530,11 @@ def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTa
         if not keys and ((error.line != 1 and not is_stamp(error.value.strip("'"))) or _A_TRIAL in error.remedy):
             raise
         remedy = f"; or add {_proposal(file, kind, Layout())} to the experiment, and no other column is read"
-        remedy = error.remedy + (f", in the experiment with {columns_of(content, file)}" if keys else remedy)
-        raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
+        if keys:
+            units = enumerate(units_of_header(TextFile(content, file))[1].items(), 1)
+            columns = ", ".join(f'{name} = {{ from = {k}, unit = "{unit}" }}' for k, (name, unit) in units)
+            remedy = f", in the experiment with columns = {{ {columns} }}"
+        raise InputError(error.rule, error.value, error.remedy + remedy, file, error.line, error.column) from None
     return raw
 
 

@@ -28,14 +28,14 @@ def written(folder: Path, export: Spoiled) -> str:
     for mass in ("m1", "m2"):
         text = text.replace(f"# {mass} = ", f"{mass} = ")
     # The tilts by height and length: no file states which side was measured.
-    return text.replace("[experiment.columns]\nheight", 'length_is = "board"\n[experiment.columns]\nheight')
+    return text.replace("columns.height", 'length_is = "board"\ncolumns.height')
 
 
 def outcome(folder: Path, export: Spoiled) -> str:
     """ "correct", "unsure" or "wrong"."""
     text = written(folder, export)
     entry = text[text.index(f'file = "{export.file}"') - 200 :]
-    columns = entry[entry.find("[experiment.columns]") :] if "[experiment.columns]" in entry else ""
+    columns = entry[entry.find("columns.") :] if "columns." in entry else ""
     kinds = [line for line in entry.split("\n") if "kind = " in line]
     if not columns or any("# unsure:" in line for line in (*kinds, *columns.split("\n"))):
         return "unsure"

@@ -23,21 +23,8 @@ TRIALS = [f"{k + 1},{angle}" for k, angle in enumerate(ANGLES)]
 HEAD = '[rig]\nname = "a"\nm1 = { value = 0.11, unit = "kg" }\nm2 = { value = 0.53, unit = "kg" }\n'
 TILT = '[[experiment]]\nkind = "static_friction"\nfile = "t.csv"\n'
 BY_NUMBER = 'columns = { angle = { from = 2, unit = "deg" } }'
-LABELS = [
-    "Mean",
-    "SD",
-    "Sum",
-    "Average",
-    "Mittelwert",
-    "Stdev",
-    "Summe",
-    "Moyenne",
-    "Standardabweichung",
-    "Écart-type",
-    "Promedio",
-    "Media",
-    "Avg:",
-]
+LABELS = ["Mean", "SD", "Sum", "Average", "Mittelwert", "Stdev", "Summe", "Moyenne", "Standardabweichung", "Écart-type"]
+LABELS += ["Promedio", "Media", "Avg:", "Std. Dev.", '"Mean value"', "standard deviation", "MAX"]
 
 
 def read(folder: Path, table: str, entry: str = TILT + BY_NUMBER) -> Rig:
@@ -49,7 +36,10 @@ def read(folder: Path, table: str, entry: str = TILT + BY_NUMBER) -> Rig:
 
 def entered(folder: Path, file: Path) -> Rig:
     """The rig that ``init --from`` makes of a file, unedited."""
-    assert cli.main(["init", str(folder), "--m1", "110", "0.5", "g", "--m2", "530", "1", "g", "--from", str(file)]) == 0
+    assert (
+        cli.capsule_id(["init", str(folder), "--m1", "110", "0.5", "g", "--m2", "530", "1", "g", "--from", str(file)])
+        == 0
+    )
     return capsule_id.read_rig(folder)
 
 
@@ -57,7 +47,7 @@ def angles_of(rig: Rig) -> np.ndarray:
     return np.degrees(rig.tables[0]["angle"])
 
 
-@pytest.mark.parametrize("label", [*LABELS, "Std. Dev.", '"Mean value"', "standard deviation", "MAX"])
+@pytest.mark.parametrize("label", LABELS)
 @pytest.mark.parametrize("gap", ["", "\n"])
 def test_labelled_statistics_are_refused_and_the_remedy_works(tmp_path: Path, label: str, gap: str) -> None:
     table = "\n".join(["Trial,Angle (deg)", *TRIALS]) + f"\n{gap}{label},31.9\n"
@@ -184,7 +174,7 @@ def test_segments_of_a_labview_file_have_one_unit(tmp_path: Path) -> None:
         (tmp_path / "a.lvm").write_text(head + "".join(part.format(unit, rows) for unit in units), encoding="utf-8")
         assert len(find_layout((tmp_path / "a.lvm").read_bytes(), tmp_path / "a.lvm", ["s", "m"]).export.lines) == 120
     content = (head + part.format("mm", rows) + part.format("um", rows)).encode()
-    with pytest.raises(capsule_id.InputError, match="same units, not mm and um.*export a file of each segment"):
+    with pytest.raises(capsule_id.InputError, match=r"same units, not mm and um.*export a file of each segment"):
         find_layout(content, Path("a.lvm"), ["s", "m"])
 
 
@@ -221,7 +211,8 @@ def test_an_entry_can_be_extended_at_its_end(tmp_path: Path) -> None:
     file.write_text(
         "\n".join(["Height (mm),Board (mm)", *(f"{h},1200" for h in (612, 598, 605, 620))]), encoding="utf-8"
     )
-    entered(tmp_path / "rig", file)
+    with pytest.raises(capsule_id.InputError, match="length_is must say"):
+        entered(tmp_path / "rig", file)
     toml = tmp_path / "rig" / "rig.toml"
     toml.write_text(toml.read_text(encoding="utf-8") + 'length_is = "base"\n', encoding="utf-8")
     assert tomllib.loads(toml.read_text(encoding="utf-8"))["experiment"][0]["length_is"] == "base"

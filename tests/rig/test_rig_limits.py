@@ -14,8 +14,8 @@ from capsule_id.experiments.kind import default_registry
 from capsule_id.rig import guess
 from capsule_id.rig.formats import EXPORTS, raw
 from capsule_id.rig.formats import text as texts
+from capsule_id.rig.formats.layouts import read_csv
 from capsule_id.rig.formats.raw import MOST_COLUMNS, NO_READING, Layout, TextFile
-from capsule_id.rig.formats.text import read_csv
 from capsule_id.rig.toml import DEEPEST_KEY, LARGEST_TEXT, closest, parse_toml
 from tests.cli_tools import small_rig
 

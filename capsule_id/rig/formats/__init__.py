@@ -18,9 +18,8 @@ from capsule_id.rig.formats.binary import (
     read_tdms,
     read_xlsx,
 )
-from capsule_id.rig.formats.layouts import read_lvm, read_text
+from capsule_id.rig.formats.layouts import read_csv, read_lvm, read_text
 from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout
-from capsule_id.rig.formats.text import read_csv
 
 
 def _unless_octave(read: Callable[[bytes, Path, Layout], Export], content: bytes, path: Path, layout: Layout) -> Export:

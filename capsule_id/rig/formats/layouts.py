@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, takewhile
+from itertools import chain, islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,11 @@ from capsule_id.errors import InputError
 from capsule_id.rig.filters import FEWEST_SAMPLES
 from capsule_id.rig.formats.raw import (
     MOST_TITLES,
+    NO_READING,
     Export,
     Layout,
     Place,
+    RawTable,
     TextFile,
     numbers_of,
     refuse_line,
@@ -26,6 +28,7 @@ from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Shape,
+    apart_marks,
     bare,
     cells_of,
     is_comment,
@@ -34,10 +37,10 @@ from capsule_id.rig.formats.text import (
     number_in,
     place_of_cell,
     rows_of,
-    shows_thousands,
     texts_of,
 )
 from capsule_id.rig.toml import shown
+from capsule_id.views import counted
 
 # any layout: Reads text exports of any layout: titles, headers, rows of units, comments, and any separator.
 #
@@ -90,8 +93,14 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     words = [k for k in wanted if is_wanted(k, headers, layout.words)]
+    first_rows = (
+        texts_of(line, delimiter) for line in islice(filter(is_row, file.lines(first)), 1 + 2 * MOST_TITLES // width)
+    )
+    columns = zip(*(cells for cells in first_rows if len(cells) >= width), strict=False)
     # The reader in C takes every mark for the decimal one.
-    quick = not numbers_of(layout.missing) and (decimal is not None or not shows_thousands(file, shape, layout.missing))
+    quick = not numbers_of(layout.missing) and (
+        decimal is not None or not apart_marks([*columns], layout.missing, None)
+    )
     rows = rows_of(file, shape, wanted, None, words) if quick else None
     stated = decimal is not None and layout.decimal == decimal
     rows = rows or rows_of(file, replace(shape, decimal=decimal, stated=stated), wanted, layout.missing, words)
@@ -256,6 +265,76 @@ def is_number(cell: str) -> bool:
 def _is_reading(cell: str, layout: Layout) -> bool:
     """Whether a cell is a number, a time stamp, or a stated missing marker."""
     return is_number(cell) or cell in layout.missing or is_stamp(cell)
+
+
+# csv: Reads CSV tables: a header ``name [unit]`` per column, then rows of numbers as any text export has them.
+
+
+_HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
+
+
+def read_csv(content: bytes, path: Path) -> RawTable:
+    """Read a CSV table; rows with a missing cell (``NO_READING``) are left out.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+
+    Raises
+    ------
+    InputError
+        Naming line and column of the first fault.
+    """
+    file = TextFile(content, path)
+    mark, units = units_of_header(file)
+    for line, row in enumerate(file.lines(1), 2):
+        if is_comment(row):
+            raise InputError("a row must be numbers", shown(row), "remove comments from the table", path, line, 1)
+    line, row = next(((k, row) for k, row in enumerate(file.lines(1), 2) if is_row(row)), (1, ""))
+    if not row:
+        raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
+    if (width := len(texts_of(row, mark))) != len(units):
+        rule, found = f"a row must have {counted(len(units), 'cell')}, as the header has", counted(width, "cell")
+        place = place_of_cell(row, mark, len(units), len(row) + 1)
+        raise InputError(rule, found, "correct the row, or the header", path, line, place)
+    layout = Layout(line, missing=NO_READING, decimal="." if mark == "," and width > 1 else None)
+    export = read_text(content, path, layout)
+    empty = [np.full(len(export.lines), np.nan)] * (width - export.width)  # every last cell is
+    columns = (*map(export.values, range(export.width)), *empty)
+    raw = RawTable(tuple(units), tuple(units.values()), columns, export.lines, export.place, export.encoding)
+    missing = np.any(np.isnan(columns), axis=0)
+    if missing.all():  # the first cell of the first row that holds none
+        here = raw.place(0, int(np.argmax([np.isnan(column[0]) for column in columns])))
+        remedy = "write a number; a table must have a row without missing cells"
+        raise InputError("a cell must not be empty", "nothing", remedy, *here)
+    return replace(raw.taken(np.flatnonzero(~missing)), lost=export.lines[missing])
+
+
+def units_of_header(file: TextFile) -> tuple[str, dict[str, str]]:
+    """Separator of a CSV table, and the units of its columns by name.
+
+    Raises
+    ------
+    InputError
+        At the first cell of the first line that is no header ``name [unit]``.
+    """
+    units, line = dict[str, str](), file.line(0)
+    mark = next((mark for mark in "\t;," if mark in line), ",")
+    refuse_wide(line.count(mark) + 1, file.path, 1)
+    for cell, column in cells_of(line, mark):
+        found = _HEADER_CELL.fullmatch(bare(cell).strip())
+        if found is None or not found[2].strip():
+            rule, remedy = (
+                "the first line must be headers `name [unit]`",
+                "head each column `name [unit]`, e.g. `time [s]` ([1]: no unit)",
+            )
+            raise InputError(rule, shown(bare(cell)), remedy, file.path, 1, column)
+        if found[1] in units:
+            twice = f"a second {found[1]}", "remove or rename it"
+            raise InputError("column names must be unique", *twice, file.path, 1, column)
+        units[found[1]] = found[2].strip()
+    return mark, units
 
 
 # lvm: Reads LabVIEW measurement files (``.lvm``): a header of the file, then segments with a header and rows of
