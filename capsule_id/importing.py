@@ -11,8 +11,6 @@ import numpy as np
 
 from capsule_id.errors import InputError, printable, refusing
 from capsule_id.experiments.kind import Kind, default_registry
-from capsule_id.records.duplicates import reading_step
-from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples
 from capsule_id.records.release import find_free_decay, find_releases
 from capsule_id.records.tones import estimate_clock, frequency_of
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
@@ -264,6 +262,7 @@ def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None
 # entry: Writes the entry of ``rig.toml`` that reads an export, with a comment and a confidence at every guess.
 
 
+_SHOWN_COLUMNS = 20
 #: Columns of a tilt, which is its own slope.
 TILT = {"angle", "height"}
 _DECIMALS = {
@@ -531,43 +530,7 @@ def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
             yield _commented(f"{'# ' * column.asked}columns.{name} = {source}", column.confidence, reason)
 
 
-# report: Describes an export before it is used: channels, units, sampling, gaps, clipping, drop-outs, first and last
-# rows.
-
-
-_SHOWN_ROWS = 3
-_SHOWN_COLUMNS = 20
-
-
-def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list[str]:
-    """The report of one file, line by line, the proposed entry of ``rig.toml`` last.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
-    dimensions = dimensions_of(kinds)
-    found = find_layout(content, path, dimensions)
-    rows = len(next(iter(found.columns.values())))
-    size = f"{counted(rows, 'row')} of {counted(found.export.width, 'column')}"
-    lines = [f"{path.name}: {size}, {len(found.columns)} with numbers"]
-    guessed = guess(found, kinds)
-    time = None
-    if guessed is not None and TIME in guessed.columns:
-        time = times_of_guess(found, guessed)
-        known = guessed.columns[TIME].unit != UNKNOWN
-        lines += _sampling(time[np.isfinite(time)]) if known else ["sampling: the file states no unit of its times"]
-    elif found.rate is not None:
-        lines.append(f"sampling: {found.rate:g} Hz, as the file states; it holds no times")
-    for index in list(found.columns)[:_SHOWN_COLUMNS]:
-        lines += _channel(found, index, dimensions, time is not None)
-    if len(found.columns) > _SHOWN_COLUMNS:
-        lines.append(counted(len(found.columns) - _SHOWN_COLUMNS, "more column"))
-    for row in [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]:
-        cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
-        lines.append(f"line {found.export.lines[row]}: {'  '.join(cells)}")
-    return [*lines, "", entry_of(content, path, kinds)[0].rstrip()]
+# clock: Puts a file on the clock of another one.
 
 
 def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:
@@ -602,39 +565,3 @@ def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kin
     offset = f'{{ value = {clock.offset:.9g}, sd = {clock.offset_sd:.2g}, unit = "s" }}'
     drift = f'{{ value = {1e6 * clock.drift:.6g}, sd = {1e6 * clock.drift_sd:.2g}, unit = "ppm" }}'
     return f"clock = {{ offset = {offset}, drift = {drift} }}  # {clock.explained:.1%} of the signal explained"
-
-
-def _sampling(time: np.ndarray) -> Iterable[str]:
-    """Rate, jitter and gaps of the times, (n,) s."""
-    steps = np.diff(time)
-    if len(steps) < 2 or not np.all(steps > 0.0):
-        yield f"sampling: the times do not increase at {counted(int(np.sum(steps <= 0.0)), 'row')}"
-        return
-    step = float(np.median(steps))
-    jitter = float(np.sqrt(np.mean((steps[np.round(steps / step) < 2.0] / step - 1.0) ** 2)))
-    yield f"sampling: {1.0 / step:.6g} Hz from {time[0]:.6g} to {time[-1]:.6g} s, jitter {jitter:.2%} of a step (rms)"
-    gaps = find_gaps(time)
-    if gaps is not None:
-        first = time[gaps.rows[0]]
-        yield f"gaps: {len(gaps.rows)}, {counted(int(gaps.lost.sum()), 'sample')} lost, the first after {first:.6g} s"
-
-
-def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record: bool) -> Iterable[str]:
-    """Range, reading step and faults of one column."""
-    values = found.columns[index]
-    missing, values = int(np.sum(np.isnan(values))), values[np.isfinite(values)]
-    name, text = found.header(index, dimensions)
-    # A lone g is a mass, unless the header says acceleration.
-    masses = () if fits_name(name, "acceleration") > 0 else ("kg",)
-    unit = unit_of(text, (*masses, *dimensions, *ANGULAR.values())) or "unit unknown"
-    step = reading_step(values)
-    line = f"column {index + 1} {name or 'without name'} [{unit}]: {values.min():.6g} to {values.max():.6g}"
-    line += f", reading step {step:.3g}" if step else ""
-    line += f", {missing} missing" if missing else ""
-    if record and len(values) > 2 and np.ptp(values) > 0.0:
-        for clipped in clipped_samples(values, np.inf):
-            line += f"; {counted(len(clipped.rows), 'sample')} clipped at {clipped.level:g}"
-        for what, rows in (("drop-out", dropouts(values)), ("frozen sample", frozen_samples(values))):
-            if len(rows):
-                line += f"; {counted(len(rows), what)}, the first in line {found.export.lines[rows[0]]}"
-    yield line

@@ -548,22 +548,19 @@ def no_readings(export: Export, layout: Layout, columns: Sequence[np.ndarray]) -
     return labels, replace(layout, data_to_line=last, missing=(*layout.missing, *sorted(codes)))
 
 
-def refuse_no_readings(export: Export, layout: Layout, columns: Sequence[int]) -> None:
-    """Refuse rows of statistics among those of a table, and codes of missing readings in its ``columns``.
+def refuse_no_readings(export: Export, layout: Layout) -> None:
+    """Refuse rows of statistics among those of a table, and codes of missing readings in the columns that ``layout`` names.
 
     Raises
     ------
     InputError
         At the first one.
     """
-    numbers = [export.values(column) for column in columns]
-    labels, other = no_readings(export, layout, numbers)
+    named = [k for k in range(export.width) if is_wanted(k, export.headers, layout.columns or ())]
+    numbers = {k: export.values(k) for k in named if not is_wanted(k, export.headers, layout.words)}
+    labels, other = no_readings(export, layout, [*numbers.values()])
     for marker in other.missing[len(layout.missing) :]:
-        rows, k = next(
-            (rows, k)
-            for k, one in zip(columns, numbers, strict=True)
-            if len(rows := np.flatnonzero(one == float(marker)))
-        )
+        k, rows = next((k, rows) for k, one in numbers.items() if len(rows := np.flatnonzero(one == float(marker))))
         rule = "a number far from all others, which programs write for no reading, must be stated as missing"
         remedy = f'add "{marker}" to missing = [...] to drop its rows, or correct the cells'
         raise InputError(rule, f"{marker} in {counted(len(rows), 'row')}", remedy, *export.place(int(rows[0]), k))

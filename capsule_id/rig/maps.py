@@ -10,7 +10,6 @@ from types import MappingProxyType
 import numpy as np
 
 from capsule_id.parameters import SAME
-from capsule_id.rig.formats.layouts import is_wanted
 from capsule_id.rig.formats.raw import NO_READING, Export, Layout, Place, RawTable
 from capsule_id.rig.formats.text import seconds_of_stamps
 from capsule_id.rig.model import NO_DRIFT, Column, Instrument, Quantity, Table
@@ -272,12 +271,6 @@ class ColumnMap:
     sources: Mapping[str, Source]
     layout: Layout
     where: Mapping[str, Wanted]
-
-    def numbers(self, export: Export) -> list[int]:
-        """The columns of a file that are read as numbers of the experiment."""
-        sources = [one for one in self.sources.values() if one.rate is None and one.unit != STAMP]
-        wanted = tuple(header for one in sources for header in (one.header, one.minus) if header is not None)
-        return [k for k in range(export.width) if is_wanted(k, export.headers, wanted)]
 
 
 def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> ColumnMap | None:

@@ -379,7 +379,7 @@ def read_tables(
             name: EXPORTS[suffix_of(file)](contents.pop(name), file, column_map.layout) for name, file in files.items()
         }
         for export in exports.values():
-            refuse_no_readings(export, column_map.layout, column_map.numbers(export))
+            refuse_no_readings(export, column_map.layout)
         parts = apply_map(entry, list(exports.values()), column_map)
         encodings = {name: export.encoding for name, export in exports.items()}
         for name, export in exports.items():
@@ -522,9 +522,8 @@ def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTa
     try:
         raw = READERS[suffix](content, file)
         _check_names(raw.names, kind, partial(raw.error, None))
-        columns = range(len(raw.names))
-        export = Export(file, (raw.names,), len(columns), raw.rows, raw.columns.__getitem__, raw.place, cells=list)
-        refuse_no_readings(export, Layout(), columns)
+        export = Export(file, (raw.names,), len(raw.names), raw.rows, raw.columns.__getitem__, raw.place, cells=list)
+        refuse_no_readings(export, Layout(columns=raw.names))
     except InputError as error:
         keys = any(f"{key} = " in error.remedy for key in LAYOUT)
         if not keys and ((error.line != 1 and not is_stamp(error.value.strip("'"))) or _A_TRIAL in error.remedy):
