@@ -525,8 +525,9 @@ def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTa
         export = Export(file, (raw.names,), len(raw.names), raw.rows, raw.columns.__getitem__, raw.place, cells=list)
         refuse_no_readings(export, Layout(columns=raw.names))
     except InputError as error:
-        keys = any(f"{key} = " in error.remedy for key in LAYOUT)
-        if not keys and ((error.line != 1 and not is_stamp(error.value.strip("'"))) or _A_TRIAL in error.remedy):
+        stamp = is_stamp(error.value.strip("'"))
+        keys = not stamp and any(f"{key} = " in error.remedy for key in LAYOUT)
+        if not (keys or stamp or error.line == 1) or _A_TRIAL in error.remedy:
             raise
         remedy = f"; or add {_proposal(file, kind, Layout())} to the experiment, and no other column is read"
         if keys:

@@ -198,6 +198,14 @@ def test_marks_of_plain_tables_are_asked_about(tmp_path: Path) -> None:
     np.testing.assert_allclose(table_["current"], [0.5, 1.0, 1.5, 2.0, 2.5])
 
 
+def test_thousands_without_decimals_are_read(tmp_path: Path) -> None:
+    """Before: IndexError, where all that shows the decimal mark is how the thousands are parted."""
+    entry = '[[experiment]]\nkind = "motor_current"\nfile = "t.csv"\n'
+    columns = 'columns = { current = { from = 1, unit = "uA" }, force = { from = 2, unit = "N" } }'
+    table = "Strom (uA);Kraft (N)\n500.000;1\n1.000.000;2\n1.500.000;3\n"
+    np.testing.assert_allclose(read(tmp_path, table, entry + columns).tables[0]["current"], [0.5, 1.0, 1.5])
+
+
 def test_no_table_of_the_repository_is_asked_about() -> None:
     for file in sorted((Path(__file__).parents[2] / "data").rglob("*.csv")):
         found = find_layout(file.read_bytes(), file, dimensions_of(default_registry()))

@@ -92,6 +92,7 @@ def test_a_fault_at_the_end_of_a_large_file_is_found() -> None:
         "1,5",
         "1.5.2",
         "TRUE",
+        '"1"',
         "1e5.5",
         "#",
         "=1+1",

@@ -95,7 +95,9 @@ def test_a_rig_in_utf_16_is_read(tmp_path: Path) -> None:
         (folder / "rig.toml").write_bytes(mark + text.encode(codec))
         assert capsule_id.read_rig(folder).name == expected.name
     (folder / "rig.toml").write_bytes(text.encode("utf-16-le"))  # without its mark
-    with pytest.raises(InputError, match=r"the file must be text, a binary file \(NUL byte\), export it as text"):
+    with pytest.raises(
+        InputError, match=r"the file must be text, a binary file \(NUL byte\), export it as text, in UTF-8"
+    ):
         capsule_id.read_rig(folder)
 
 

@@ -20,6 +20,7 @@ from capsule_id.rig.formats.raw import (
     Place,
     RawTable,
     TextFile,
+    lines_of,
     numbers_of,
     refuse_line,
     refuse_wide,
@@ -165,7 +166,7 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
         raise InputError(
             f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
             "none",
-            "export the readings as text, or state data_from_line",
+            "export the readings as numbers in lines, or state data_from_line = ... in an entry that reads them",
             file.path,
             1 if layout.data_from_line is None else len(lines),
             1,
@@ -288,9 +289,12 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     """
     file = TextFile(content, path)
     mark, units = units_of_header(file)
-    for line, row in enumerate(file.lines(1), 2):
-        if is_comment(row):
-            raise InputError("a row must be numbers", shown(row), "remove comments from the table", path, line, 1)
+    blocks = ((number, block) for number, block in file.blocks(1) if re.search(rb'["#%]', block))
+    for line, row in ((number + k, row) for number, block in blocks for k, row in enumerate(lines_of(block), 1)):
+        quoted = (each for each in cells_of(row, mark) if '"' in each[0] and bare(each[0]) not in NO_READING)
+        for cell, column in [(row.strip(), 1)] if is_comment(row) else quoted:  # a mark may be left of a damaged cell
+            remedy = "remove comments and quotation marks from the table"
+            raise InputError("a row must be numbers", shown(cell), remedy, path, line, column)
     line, row = next(((k, row) for k, row in enumerate(file.lines(1), 2) if is_row(row)), (1, ""))
     if not row:
         raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)

@@ -226,7 +226,10 @@ def _encoding(raw: bytes, path: Path) -> str:
     InputError
         At the first byte that is no text.
     """
-    rule, binary = "the file must be text", ("a binary file (NUL byte)", "export it as text")
+    rule, binary = (
+        "the file must be text",
+        ("a binary file (NUL byte)", "export it as text, in UTF-8"),
+    )
     marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if not marked and (nul := raw.find(b"\0")) >= 0:
         raise InputError(rule, *binary, path, *place_of_byte(raw[:nul], "utf-8"))

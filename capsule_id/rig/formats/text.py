@@ -435,7 +435,7 @@ def apart_marks(columns: Sequence[Sequence[str]], missing: Sequence[str], decima
     for k, texts in enumerate(columns):
         mark = decimal_mark(texts := [bare(text) for text in texts], missing)
         marked = [text for text in texts if mark and mark in text]
-        if mark and number_in(marked[0], mark) is not None:  # a date shows no decimal mark
+        if mark and marked and number_in(marked[0], mark) is not None:  # a date shows no decimal mark
             marks[k] = mark
             if all((found := _GROUPED.fullmatch(text)) and text[-4] == found["mark"] for text in marked):
                 # 2.501 is no number of a few beside -930 in its column.
