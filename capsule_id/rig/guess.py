@@ -469,7 +469,7 @@ STATISTICS, BESIDE = (
 MOST_TRIALS = 1000
 #: Largest probability that readings agree by chance with statistics of the rows above them; ratio for a number outside
 #: twice the range of those; most rows of statistics without a label, and fewest rows above them.
-CHANCE, OUTSIDE, MOST_BELOW, FEWEST_ABOVE = 1e-4, 1e-2, 4, 3
+CHANCE, OUTSIDE, MOST_BELOW, FEWEST_ABOVE = 2e-5, 1e-2, 4, 3
 #: Largest difference of a rounded number from the exact one, in units of its last digit, with a margin.
 HALF_DIGIT = 0.51
 #: Numbers that programs write for no reading, and the size from which no reading of a rig is.

@@ -206,6 +206,23 @@ def test_thousands_without_decimals_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(read(tmp_path, table, entry + columns).tables[0]["current"], [0.5, 1.0, 1.5])
 
 
+@pytest.mark.parametrize("suffix", ["log", "asc"])
+@pytest.mark.parametrize("unit", ["mils", "thou"])
+def test_logs_in_mils_enter(tmp_path: Path, suffix: str, unit: str) -> None:
+    rows = "".join(f"{t:.3f}\t{x / 25.4:.4f}\n" for t, x in zip(TIME, DECAY, strict=True))
+    (tmp_path / f"a.{suffix}").write_text(f"Time (s)\tDisp ({unit})\n{rows}", encoding="utf-8")
+    np.testing.assert_allclose(
+        entered(tmp_path / "rig", tmp_path / f"a.{suffix}").tables[0]["x_rel"], 1e-6 * DECAY, atol=2e-9
+    )
+
+
+def test_a_layout_that_init_cannot_take_is_stated_by_hand(tmp_path: Path) -> None:
+    """Before: "state data_from_line = 1", for which ``init --from`` has no option."""
+    (tmp_path / "t.csv").write_text("Run 3\nA;B\nx;1,5 mm\ny;2 mm\n", encoding="utf-8")
+    with pytest.raises(capsule_id.InputError, match="in the entry that you write: capsule-id init DIR"):
+        capsule_id.propose_entry(tmp_path / "t.csv")
+
+
 def test_no_table_of_the_repository_is_asked_about() -> None:
     for file in sorted((Path(__file__).parents[2] / "data").rglob("*.csv")):
         found = find_layout(file.read_bytes(), file, dimensions_of(default_registry()))

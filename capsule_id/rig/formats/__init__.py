@@ -27,7 +27,10 @@ def _unless_octave(read: Callable[[bytes, Path, Layout], Export], content: bytes
     return (read_octave if content.startswith(OCTAVE) else read)(content, path, layout)
 
 
-TEXTS = {**dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), partial(_unless_octave, read_text)), ".lvm": read_lvm}
+TEXTS = {
+    **dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".log", ".asc"), partial(_unless_octave, read_text)),
+    ".lvm": read_lvm,
+}
 
 
 def suffix_of(path: Path) -> str:

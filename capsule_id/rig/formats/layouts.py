@@ -73,14 +73,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     _refuse_ambiguous_comma(file, first, delimiter, layout)
     for cell, position in cells_of(row, delimiter):
         if cell.count('"') % 2:  # rows such as "10,2","1,5": the separator would cut quoted numbers in two
-            raise InputError(
-                "a cell in quotation marks must not hold the separator of the cells",
-                shown(row.strip()),
-                "export with a decimal point, or with semicolons between the cells",
-                file.path,
-                first + 1,
-                position,
-            )
+            rule = "a cell in quotation marks must not hold the separator of the cells"
+            remedy = "export with a decimal point, or with semicolons between the cells"
+            raise InputError(rule, shown(row.strip()), remedy, path, first + 1, position)
     *cells, last = texts_of(row, delimiter)
     blank = bool(cells) and not last
     trailing = blank and all(not texts_of(line, delimiter)[-1] for line in file.lines(first) if is_row(line))
@@ -112,10 +107,8 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    def cells_of_rows() -> Iterator[list[str]]:
-        return (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
-
-    return Export(path, headers, width, lines, rows.column, place, file.encoding, rows.words, cells=cells_of_rows)
+    texts, every = rows.words, lambda: (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
+    return Export(path, headers, width, lines, rows.column, place, file.encoding, texts, cells=every)
 
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
@@ -166,7 +159,7 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
         raise InputError(
             f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
             "none",
-            "export the readings as numbers in lines, or state data_from_line = ... in an entry that reads them",
+            "export the readings as numbers, a row in each line",
             file.path,
             1 if layout.data_from_line is None else len(lines),
             1,
