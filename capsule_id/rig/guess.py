@@ -455,18 +455,20 @@ def _rate(beginning: bytes, names: Sequence[str], singles: dict[int, float]) -> 
 # rows: Finds what stands among readings and is none: rows of statistics, and values that stand for a missing reading.
 
 
-#: Words of the labels of rows of statistics, without accents, and words that may stand beside them.
-STATISTICS, BESIDE = (
+#: Words of the labels of rows of statistics, without accents; those that may be a remark on a reading too, unless they
+#: stand below all readings or beside others; and words that may stand beside them.
+STATISTICS, EXTREMES, BESIDE = (
     frozenset(words.split())
     for words in (
         "mean average avg sd std stdev stddev sum total variance median mittelwert mittel durchschnitt summe gesamt "
         "standardabweichung stabw stdabw varianz moyenne somme ecart ecarttype media promedio suma desviacion desvest "
-        "somma deviation deviazione scarto mediana mediane min max minimum maximum minimo massimo maximo",
+        "somma deviation deviazione scarto mediana mediane",
+        "min max minimum maximum minimo massimo maximo",
         "value values of the der aller de des di la standard dev estandar tipica type error fehler sem n s x",
     )
 )
-#: Most rows of a table in which rows of statistics are looked for: a longer one is a record.
-MOST_TRIALS = 1000
+#: Most rows and cells of a table in which rows of statistics are looked for: a longer one is a record.
+MOST_TRIALS, MOST_CELLS = 1000, 20_000
 #: Largest probability that readings agree by chance with statistics of the rows above them; ratio for a number outside
 #: twice the range of those; most rows of statistics without a label, and fewest rows above them.
 CHANCE, OUTSIDE, MOST_BELOW, FEWEST_ABOVE = 2e-5, 1e-2, 4, 3
@@ -493,8 +495,8 @@ def code_in(values: np.ndarray) -> float | None:
 
 def is_statistic(cell: str) -> bool:
     """Whether a cell is the label of a row of statistics, such as ``Mean`` or ``Standard deviation:``."""
-    words = {*_bare(cell).split("_")} - {""}
-    return bool(words & STATISTICS) and words <= STATISTICS | BESIDE
+    words = {*_bare(cell).split("_")} - {""} if cell[:1].isalpha() else set[str]()
+    return bool(words & (STATISTICS | EXTREMES)) and words <= STATISTICS | EXTREMES | BESIDE
 
 
 def statistics_below(columns: Sequence[np.ndarray]) -> int:
@@ -535,15 +537,18 @@ def no_readings(export: Export, layout: Layout, columns: Sequence[np.ndarray]) -
     is stated. Labels of all rows are none, nor are those that ``where`` selects.
     """
     labels, codes = dict[int, str](), {repr(one).removesuffix(".0") for one in map(code_in, columns) if one is not None}
-    if export.cells is not None and len(export.lines) <= MOST_TRIALS:
+    count = len(export.lines)
+    if export.cells is not None and count <= MOST_TRIALS and count * export.width <= MOST_CELLS:
         kept = {k for k in range(export.width) if is_wanted(k, export.headers, layout.words)}
         cells = ((row, cell) for row, each in enumerate(export.cells()) for k, cell in enumerate(each) if k not in kept)
         labels = {row: cell for row, cell in cells if is_statistic(cell)}
-        if len(labels) in (0, len(export.lines)):
+        if not any(STATISTICS & {*_bare(label).split("_")} for label in labels.values()):
+            labels = {row: label for row, label in labels.items() if labels.keys() >= {*range(row, count)}}
+        if len(labels) in (0, count):
             below = statistics_below(columns) if columns and layout.data_to_line is None else 0
-            labels = dict.fromkeys(range(len(export.lines) - below, len(export.lines)), "")
+            labels = dict.fromkeys(range(count - below, count), "")
     first = min(labels, default=0)
-    at_end = first > 0 and len(labels) == len(export.lines) - first
+    at_end = first > 0 and len(labels) == count - first
     last = int(export.lines[first - 1]) if at_end else layout.data_to_line
     return labels, replace(layout, data_to_line=last, missing=(*layout.missing, *sorted(codes)))
 

@@ -107,6 +107,13 @@ def test_tables_of_means_and_selected_rows_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(angles_of(read(tmp_path, both, where)), ANGLES)
 
 
+def test_extremes_that_are_remarks_are_read(tmp_path: Path) -> None:
+    table = "Remark,Angle (deg)\n" + "".join(f"{'max' if k == 3 else ''},{angle}\n" for k, angle in enumerate(ANGLES))
+    np.testing.assert_allclose(angles_of(read(tmp_path, table)), ANGLES)
+    with pytest.raises(capsule_id.InputError, match="'Max', state data_to_line = 6"):
+        read(tmp_path, "\n".join(["Trial,Angle (deg)", *TRIALS, "Max,33.1", "Mean,31.94", "Min,30.9"]))
+
+
 def test_labels_and_numbers_of_statistics() -> None:
     assert not any(
         map(is_statistic, ["", "steel", "mean surface", "ok", "standard", "s", "n", "max. load reached", "3"])
