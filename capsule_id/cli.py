@@ -84,7 +84,7 @@ def _commands() -> tuple[tuple[str, Any, str, str], ...]:
             "a rig folder with a commented rig.toml, or one that reads given exports",
             "my-rig --from decay.csv",
         ),
-        ("import", import_file, "describe an export and propose the entry that reads it", "decay.csv"),
+        ("import", import_file, "print the entry that reads an export", "decay.csv"),
         ("check", check, "check a rig folder and list problems before a fit", "my-rig --figures figures"),
         ("fit", fit, "fit a rig folder, as fit-params does", "my-rig --seed 1"),
         ("synthesize", synthesize, "a rig folder with known truth", "twin --seed 1 --set k1=1500"),

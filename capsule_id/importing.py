@@ -11,13 +11,10 @@ import numpy as np
 
 from capsule_id.errors import InputError, printable, refusing
 from capsule_id.experiments.kind import Kind, default_registry
-from capsule_id.records.duplicates import reading_step
-from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples
 from capsule_id.records.release import find_free_decay, find_releases
 from capsule_id.records.tones import estimate_clock, frequency_of
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
-from capsule_id.rig.formats.layouts import delimiter_of
-from capsule_id.rig.formats.raw import TextFile
+from capsule_id.rig.formats.raw import NO_READING
 from capsule_id.rig.guess import (
     TIME,
     Assignment,
@@ -37,6 +34,7 @@ from capsule_id.rig.guess import (
     times_of_trace,
     unit_of,
 )
+from capsule_id.rig.maps import LAYOUT
 from capsule_id.rig.schema import SHORTEST_RECORD, QuantityRule
 from capsule_id.rig.times import evened
 from capsule_id.rig.units import SIGNALS, UNKNOWN, factor_to_si, symbol_named
@@ -264,13 +262,13 @@ def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None
 # entry: Writes the entry of ``rig.toml`` that reads an export, with a comment and a confidence at every guess.
 
 
+_SHOWN_COLUMNS = 20
 #: Columns of a tilt, which is its own slope.
 TILT = {"angle", "height"}
 _DECIMALS = {
     ".": "the header has a name for every number between commas",
     ",": "one column with a comma in every number",
 }
-_SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "spaces"}
 
 
 def dimensions_of(kinds: Mapping[str, Kind]) -> tuple[str, ...]:
@@ -327,22 +325,27 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
         If the file cannot be read.
     """
     dimensions = dimensions_of(kinds)
-    found = find_layout(content, path, dimensions)
+    try:
+        found = find_layout(content, path, dimensions)
+    except InputError as error:
+        by_hand = f"{error.remedy}, in the entry that you write: capsule-id init DIR makes a rig.toml with examples"
+        remedy = by_hand if any(f"{key} = " in error.remedy for key in LAYOUT) else error.remedy
+        raise InputError(error.rule, error.value, remedy, error.file, error.line, error.column) from None
     guessed, others = guess(found, kinds), found.export.others
     if others:
         found = replace(found, layout=replace(found.layout, sheet=found.export.sheet))
-    entries = [_entry(found, guessed, content, kinds)]
+    entries = [_entry(found, guessed, kinds)]
     for sheet in others:
         try:
             other = find_layout(content, path, dimensions, sheet)
         except InputError as error:
             entries.append(f"#: Sheet {sheet!r} is not read: {error.rule}, {' '.join(error.value.split())}.\n")
         else:
-            entries.append(_entry(other, guess(other, kinds), content, kinds))
+            entries.append(_entry(other, guess(other, kinds), kinds))
     return "\n".join(entries), guessed
 
 
-def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Mapping[str, Kind]) -> str:
+def _entry(found: FoundLayout, guessed: Guess | None, kinds: Mapping[str, Kind]) -> str:
     """The lines of ``[[experiment]]`` for an export with its guess."""
     unread, file = list(_unread_lines(found, dimensions_of(kinds))), found.export.path.name
     if guessed is None:
@@ -370,13 +373,13 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
     kind = kinds[guessed.kind]
     lines = [*unread, *_unused_lines(found, guessed, kind)]
     lines += ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
-    lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
+    lines += [_commented(f"file = {json.dumps(file)}", "sure", counted(len(found.export.lines), "row"))]
     lines += _layout_lines(found)
     lines += [
         _commented(line, "unsure" if UNKNOWN in line else "likely", why) for line, why in lines_of_labels(found, kind)
     ]
     lines += _setting_lines(found, guessed, kind)
-    lines += ["[experiment.columns]", *_column_lines(found, guessed, kind)]
+    lines += _column_lines(found, guessed, kind)
     return "\n".join(lines) + "\n"
 
 
@@ -403,8 +406,8 @@ def _unused_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
     weighed = [(i, unit_of(found.header(i, ["kg"])[1], ["kg"])) for i in found.columns if i not in used]
     index, unit = next(((i, unit) for i, unit in weighed if unit in ("kg", "g", "lb")), (0, None))
     if unit and "normal_force" in kind.optional and "normal_force" not in guessed.columns:
-        source = f'normal_force = {{ from = {source_of(found, index)}, unit = "{unit}f" }}'
-        yield f"#: If {found.names[index]!r} is the mass that presses on the track, add to the columns: {source}"
+        source = f'columns.normal_force = {{ from = {source_of(found, index)}, unit = "{unit}f" }}'
+        yield f"#: If {found.names[index]!r} is the mass that presses on the track, add: {source}"
 
 
 def _commented(line: str, confidence: str, reason: str) -> str:
@@ -412,19 +415,11 @@ def _commented(line: str, confidence: str, reason: str) -> str:
     return f"{line}  # {confidence}: {' '.join(reason.split())}"
 
 
-def _description(found: FoundLayout, content: bytes) -> str:
-    """Rows and separator of a file in words."""
-    text = counted(len(found.export.lines), "row")
-    if found.export.path.suffix.lower() not in (".csv", ".txt", ".tsv", ".dat"):
-        return text
-    line = TextFile(content, found.export.path).line(int(found.export.lines[0]) - 1)
-    return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
-
-
 def _layout_lines(found: FoundLayout) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
     used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
     label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{found.export.path.stem}_{used.sheet}") if used.sheet else None
+    codes = [text for text in used.missing if text not in NO_READING]
     longest = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
     # A record that a line of text interrupts is no record and a footer.
     parted = sorted(last - first for first, last in found.blocks)[-2:-1] > [FEWEST_SAMPLES]
@@ -436,6 +431,7 @@ def _layout_lines(found: FoundLayout) -> Iterable[str]:
             "unsure" if parted else "likely",
             f"{longest}; the others are not read" if len(found.blocks) > 1 else "the last row of readings",
         ),
+        ("missing", codes or None, "likely", "far from all other numbers of their column: codes for no reading"),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),
         ("sheet", used.sheet, "sure", "several sheets hold numbers, each has an entry"),
         ("label", label, "sure", "names of experiments differ"),
@@ -513,10 +509,12 @@ def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
         rate, confidence, reason = f'"{UNKNOWN}"', "unsure", "the file states no rate"
         if guessed.rate is not None:
             rate, confidence, reason = f"{guessed.rate:g}", "likely", "the file states this rate and no times"
-        yield _commented(f'{TIME} = {{ rate = {{ value = {rate}, unit = "Hz" }} }}', confidence, reason)
+        yield _commented(f'columns.{TIME} = {{ rate = {{ value = {rate}, unit = "Hz" }} }}', confidence, reason)
     for index in times_of_trace(found, kind)[:1]:  # check refuses it: no sample of a trace may pass for a trial
         source = f'{{ from = {source_of(found, index)}, unit = "{unit_of(found.header(index, ["s"])[1], ["s"]) or UNKNOWN}" }}'
-        yield _commented(f"{TIME} = {source}", "unsure", f"a record in time: read the trials of {kind.name} off it")
+        yield _commented(
+            f"columns.{TIME} = {source}", "unsure", f"a record in time: read the trials of {kind.name} off it"
+        )
     for name, column in guessed.columns.items():
         for each in (column, *column.rivals):
             factor = "" if each.scale is None else f", scale = {each.scale:.10g}"
@@ -524,46 +522,10 @@ def _column_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
             unit = signal if each.unit == UNKNOWN and signal in SIGNALS else each.unit
             source = f'{{ from = {source_of(found, each.index)}, unit = "{unit}"{factor} }}'
             reason = column.reason if each is column else "or this one"
-            yield _commented(f"{'# ' * column.asked}{name} = {source}", column.confidence, reason)
+            yield _commented(f"{'# ' * column.asked}columns.{name} = {source}", column.confidence, reason)
 
 
-# report: Describes an export before it is used: channels, units, sampling, gaps, clipping, drop-outs, first and last
-# rows.
-
-
-_SHOWN_ROWS = 3
-_SHOWN_COLUMNS = 20
-
-
-def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list[str]:
-    """The report of one file, line by line, the proposed entry of ``rig.toml`` last.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
-    dimensions = dimensions_of(kinds)
-    found = find_layout(content, path, dimensions)
-    rows = len(next(iter(found.columns.values())))
-    size = f"{counted(rows, 'row')} of {counted(found.export.width, 'column')}"
-    lines = [f"{path.name}: {size}, {len(found.columns)} with numbers"]
-    guessed = guess(found, kinds)
-    time = None
-    if guessed is not None and TIME in guessed.columns:
-        time = times_of_guess(found, guessed)
-        known = guessed.columns[TIME].unit != UNKNOWN
-        lines += _sampling(time[np.isfinite(time)]) if known else ["sampling: the file states no unit of its times"]
-    elif found.rate is not None:
-        lines.append(f"sampling: {found.rate:g} Hz, as the file states; it holds no times")
-    for index in list(found.columns)[:_SHOWN_COLUMNS]:
-        lines += _channel(found, index, dimensions, time is not None)
-    if len(found.columns) > _SHOWN_COLUMNS:
-        lines.append(counted(len(found.columns) - _SHOWN_COLUMNS, "more column"))
-    for row in [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]:
-        cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
-        lines.append(f"line {found.export.lines[row]}: {'  '.join(cells)}")
-    return [*lines, "", entry_of(content, path, kinds)[0].rstrip()]
+# clock: Puts a file on the clock of another one.
 
 
 def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:
@@ -598,39 +560,3 @@ def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kin
     offset = f'{{ value = {clock.offset:.9g}, sd = {clock.offset_sd:.2g}, unit = "s" }}'
     drift = f'{{ value = {1e6 * clock.drift:.6g}, sd = {1e6 * clock.drift_sd:.2g}, unit = "ppm" }}'
     return f"clock = {{ offset = {offset}, drift = {drift} }}  # {clock.explained:.1%} of the signal explained"
-
-
-def _sampling(time: np.ndarray) -> Iterable[str]:
-    """Rate, jitter and gaps of the times, (n,) s."""
-    steps = np.diff(time)
-    if len(steps) < 2 or not np.all(steps > 0.0):
-        yield f"sampling: the times do not increase at {counted(int(np.sum(steps <= 0.0)), 'row')}"
-        return
-    step = float(np.median(steps))
-    jitter = float(np.sqrt(np.mean((steps[np.round(steps / step) < 2.0] / step - 1.0) ** 2)))
-    yield f"sampling: {1.0 / step:.6g} Hz from {time[0]:.6g} to {time[-1]:.6g} s, jitter {jitter:.2%} of a step (rms)"
-    gaps = find_gaps(time)
-    if gaps is not None:
-        first = time[gaps.rows[0]]
-        yield f"gaps: {len(gaps.rows)}, {counted(int(gaps.lost.sum()), 'sample')} lost, the first after {first:.6g} s"
-
-
-def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record: bool) -> Iterable[str]:
-    """Range, reading step and faults of one column."""
-    values = found.columns[index]
-    missing, values = int(np.sum(np.isnan(values))), values[np.isfinite(values)]
-    name, text = found.header(index, dimensions)
-    # A lone g is a mass, unless the header says acceleration.
-    masses = () if fits_name(name, "acceleration") > 0 else ("kg",)
-    unit = unit_of(text, (*masses, *dimensions, *ANGULAR.values())) or "unit unknown"
-    step = reading_step(values)
-    line = f"column {index + 1} {name or 'without name'} [{unit}]: {values.min():.6g} to {values.max():.6g}"
-    line += f", reading step {step:.3g}" if step else ""
-    line += f", {missing} missing" if missing else ""
-    if record and len(values) > 2 and np.ptp(values) > 0.0:
-        for clipped in clipped_samples(values, np.inf):
-            line += f"; {counted(len(clipped.rows), 'sample')} clipped at {clipped.level:g}"
-        for what, rows in (("drop-out", dropouts(values)), ("frozen sample", frozen_samples(values))):
-            if len(rows):
-                line += f"; {counted(len(rows), what)}, the first in line {found.export.lines[rows[0]]}"
-    yield line

@@ -21,7 +21,7 @@ import numpy as np
 from capsule_id import load
 from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.text import read_csv
+from capsule_id.rig.formats.layouts import read_csv
 from tests.report.test_damaged_results import DAMAGES
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 from tests.rig.formats.test_damaged_files import COLUMNS, WRITERS, damaged, refusal

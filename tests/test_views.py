@@ -21,7 +21,7 @@ SEVERAL = {
     "{count} plateaus", "{len(parts)} plateaus", "{len(view.time)} samples", "{len(view.section_x_rel)} points",
     "{len(names)} parameters", "{samples} samples", "{len(values)} samples", "{records} records",
     "{rows} rows", "{count} friction laws",
-    "{len(found.columns)} with numbers", "{len(found.blocks)} blocks", "{len(found)} releases", "{len(several)} releases",
+    "{len(found.blocks)} blocks", "{len(found)} releases", "{len(several)} releases",
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""``capsule-id import FILE``: describe an export and propose the entry of ``rig.toml`` that reads it; writes nothing."""
+"""``capsule-id import FILE``: print the entry of ``rig.toml`` that reads an export, as ``init --from`` writes it."""
 
 import argparse
 
@@ -6,7 +6,7 @@ from capsule_id.commands import PATH
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
-from capsule_id.importing import clock_line, import_report, read_file
+from capsule_id.importing import clock_line, propose_entry, read_file
 
 OPTIONS = {
     "": (
@@ -18,7 +18,7 @@ OPTIONS = {
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the report to standard output; 0.
+    """Print the entry, or the line of the clock, to standard output; 0.
 
     Raises
     ------
@@ -32,9 +32,9 @@ def run(args: argparse.Namespace) -> int:
             "name the file of the other logger and the common signal",
             args.file,
         )
-    kinds, content = default_registry(), read_file(args.file)
     if args.clock_of is None:
-        say("\n".join(import_report(content, args.file, kinds)))
+        say(propose_entry(args.file).rstrip())
     else:
-        say(clock_line({args.clock_of: read_file(args.clock_of), args.file: content}, args.common, kinds))
+        files = {path: read_file(path) for path in (args.clock_of, args.file)}
+        say(clock_line(files, args.common, default_registry()))
     return 0

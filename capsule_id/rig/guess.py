@@ -6,6 +6,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from itertools import chain, groupby, pairwise, product, takewhile
 from pathlib import Path
 from typing import Literal
@@ -14,9 +15,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from capsule_id.errors import InputError, printable
+from capsule_id.parameters import ROUNDING
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
-from capsule_id.rig.formats.layouts import delimiter_of, is_number, split_bare
+from capsule_id.rig.formats.layouts import delimiter_of, is_number, is_wanted, split_bare
 from capsule_id.rig.formats.raw import (
     COMPRESSED,
     NO_READING,
@@ -32,6 +34,7 @@ from capsule_id.rig.schema import KindRule
 from capsule_id.rig.times import evened
 from capsule_id.rig.toml import shown
 from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si, scale, symbol_named
+from capsule_id.views import counted
 
 # headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
 
@@ -282,6 +285,9 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
         first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
         layout = replace(layout, data_from_line=first, data_to_line=last)
         export, (columns, singles, unread) = read(layout)
+    if (other := no_readings(export, layout, [*columns.values()])[1]) != layout:
+        layout = other
+        export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
     numbers = tuple(index + 1 for index in unread)
@@ -446,6 +452,131 @@ def _rate(beginning: bytes, names: Sequence[str], singles: dict[int, float]) -> 
     return None
 
 
+# rows: Finds what stands among readings and is none: rows of statistics, and values that stand for a missing reading.
+
+
+#: Words of the labels of rows of statistics, without accents; those that may be a remark on a reading too, unless they
+#: stand below all readings or beside others; and words that may stand beside them.
+STATISTICS, EXTREMES, BESIDE = (
+    frozenset(words.split())
+    for words in (
+        "mean average avg sd std stdev stddev sum total variance median mittelwert mittel durchschnitt summe gesamt "
+        "standardabweichung stabw stdabw varianz moyenne somme ecart ecarttype media promedio suma desviacion desvest "
+        "somma deviation deviazione scarto mediana mediane",
+        "min max minimum maximum minimo massimo maximo",
+        "value values of the der aller de des di la standard dev estandar tipica type error fehler sem n s x",
+    )
+)
+#: Most rows and cells of a table in which rows of statistics are looked for: a longer one is a record.
+MOST_TRIALS, MOST_CELLS = 1000, 20_000
+#: Largest probability that readings agree by chance with statistics of the rows above them; ratio for a number outside
+#: twice the range of those; most rows of statistics without a label, and fewest rows above them.
+CHANCE, OUTSIDE, MOST_BELOW, FEWEST_ABOVE = 2e-5, 1e-2, 4, 3
+#: Largest difference of a rounded number from the exact one, in units of its last digit, with a margin.
+HALF_DIGIT = 0.51
+#: Numbers that programs write for no reading, and the size from which no reading of a rig is.
+_NO_READING = re.compile(r"-?(?:9{3,}(?:\.(?:9+|25))?|9{2,}\.9+)|32767|-32768|65535|2147483647|-2147483648")
+BEYOND = 1e30
+#: Distance of such a number from all others, in ranges of those: of one alone, and of one that is repeated.
+FAR_ALONE, FAR = 10.0, 1.0
+
+
+def code_in(values: np.ndarray) -> float | None:
+    """The number in a column, (n,), that stands for no reading, far from all others; None without one."""
+    finite = values[np.isfinite(values)]
+    for end in (float(finite.min()), float(finite.max())) if finite.size > 2 else ():
+        rest = finite[finite != end]
+        apart = FAR_ALONE if finite.size - rest.size == 1 else FAR
+        known = rest.size > 1 and _NO_READING.fullmatch(f"{end:.7g}")
+        if abs(end) >= BEYOND or (known and min(np.abs([rest.min() - end, rest.max() - end])) > apart * np.ptp(rest)):
+            return end
+    return None
+
+
+def is_statistic(cell: str) -> bool:
+    """Whether a cell is the label of a row of statistics, such as ``Mean`` or ``Standard deviation:``."""
+    words = {*_bare(cell).split("_")} - {""} if cell[:1].isalpha() else set[str]()
+    return bool(words & (STATISTICS | EXTREMES)) and words <= STATISTICS | EXTREMES | BESIDE
+
+
+def statistics_below(columns: Sequence[np.ndarray]) -> int:
+    """Number of last rows that are statistics of all rows above them in every column, (n,) each; 0 without such rows.
+
+    In each row one statistic agrees in all columns, to the digits written, where that is no chance.
+    """
+    table = np.column_stack(columns)
+    for rows in range(min(MOST_BELOW, len(table) - FEWEST_ABOVE), 0, -1):
+        here = table[:, np.isfinite(table[-rows:]).all(axis=0)]
+        above = here[:-rows][np.isfinite(here[:-rows]).all(axis=1)]
+        if len(above) >= FEWEST_ABOVE and here.size and _by_chance(above, here[-rows:]) < CHANCE:
+            return rows
+    return 0
+
+
+def _by_chance(above: np.ndarray, below: np.ndarray) -> float:
+    """Probability that rows, (k, c), agree as they do with statistics of the rows above them, (n, c); 1 where they do not."""
+    mean, sds = np.mean(above, axis=0), [np.std(above, axis=0, ddof=k) for k in (1, 0)]
+    spread, known = sds[0], np.array([mean, np.median(above, axis=0), np.min(above, axis=0), np.max(above, axis=0), *sds,
+                                      sds[0] / np.sqrt(len(above)), np.sum(above, axis=0)])  # fmt: skip
+    steps = np.reshape(
+        [10.0 ** float(Decimal(repr(one)).as_tuple().exponent) for one in below.ravel().tolist()], below.shape
+    )
+    near = np.maximum(HALF_DIGIT * steps, ROUNDING * np.abs(below))
+    agree = np.all(np.abs(below[:, None] - known) <= near[:, None], axis=2).any(axis=1).all()
+    # By the density of a normal distribution. A number that stands above too, or in all rows, was set.
+    chance = np.minimum(near / np.maximum(spread, np.finfo(float).tiny), 1.0)
+    chance *= np.where(np.abs(below - 0.5 * (known[2] + known[3])) > 1.5 * np.ptp(above, axis=0), OUTSIDE, 1.0)
+    chance[(spread == 0.0) | np.any(below[:, None] == above, axis=1)] = 1.0
+    return float(np.prod(chance)) if agree else 1.0
+
+
+def no_readings(export: Export, layout: Layout, columns: Sequence[np.ndarray]) -> tuple[dict[int, str], Layout]:
+    """Rows of statistics -> their labels, and the layout that leaves them out and states codes of missing readings.
+
+    ``columns`` are those that are read. Rows below all others are known by their numbers too, "", unless ``data_to_line``
+    is stated. Labels of all rows are none, nor are those that ``where`` selects.
+    """
+    labels, codes = dict[int, str](), {repr(one).removesuffix(".0") for one in map(code_in, columns) if one is not None}
+    count = len(export.lines)
+    if export.cells is not None and count <= MOST_TRIALS and count * export.width <= MOST_CELLS:
+        kept = {k for k in range(export.width) if is_wanted(k, export.headers, layout.words)}
+        cells = ((row, cell) for row, each in enumerate(export.cells()) for k, cell in enumerate(each) if k not in kept)
+        labels = {row: cell for row, cell in cells if is_statistic(cell)}
+        if not any(STATISTICS & {*_bare(label).split("_")} for label in labels.values()):
+            labels = {row: label for row, label in labels.items() if labels.keys() >= {*range(row, count)}}
+        if len(labels) in (0, count):
+            below = statistics_below(columns) if columns and layout.data_to_line is None else 0
+            labels = dict.fromkeys(range(count - below, count), "")
+    first = min(labels, default=0)
+    at_end = first > 0 and len(labels) == count - first
+    last = int(export.lines[first - 1]) if at_end else layout.data_to_line
+    return labels, replace(layout, data_to_line=last, missing=(*layout.missing, *sorted(codes)))
+
+
+def refuse_no_readings(export: Export, layout: Layout) -> None:
+    """Refuse rows of statistics among those of a table, and codes of missing readings in the columns that ``layout`` names.
+
+    Raises
+    ------
+    InputError
+        At the first one.
+    """
+    named = [k for k in range(export.width) if is_wanted(k, export.headers, layout.columns or ())]
+    numbers = {k: export.values(k) for k in named if not is_wanted(k, export.headers, layout.words)}
+    labels, other = no_readings(export, layout, [*numbers.values()])
+    for marker in other.missing[len(layout.missing) :]:
+        k, rows = next((k, rows) for k, one in numbers.items() if len(rows := np.flatnonzero(one == float(marker))))
+        rule = "a number far from all others, which programs write for no reading, must be stated as missing"
+        remedy = f'add "{marker}" to missing = [...] to drop its rows, or correct the cells'
+        raise InputError(rule, f"{marker} in {counted(len(rows), 'row')}", remedy, *export.place(int(rows[0]), k))
+    for row, label in labels.items():
+        ends = f"state data_to_line = {other.data_to_line}"
+        either = f"{ends}, or data_to_line = {export.lines[-1]} if these are readings"
+        remedy = either if not label else ends if other != layout else "delete the row"
+        value = shown(label) if label else "numbers that are statistics of the rows above"
+        raise InputError("a row of statistics must not be read as a trial", value, remedy, *export.place(row, 0))
+
+
 # columns: Guesses which columns of a file are those of one kind, and their units; proposes a column map for error
 # lines.
 
@@ -605,9 +736,11 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     unit = unit_of(text, [rule.si]) if text else None
     constant = is_constant(found, index)
     named, meant = fits_name(stem, name), meaning(stem, name, kind.meant)
-    said = f"the file says {found.names[index]!r}"
+    said, missing = f"the file says {found.names[index]!r}", "the file states no unit"
     if (text and unit is None) or named < 0 or (constant and rule.varies):
         return None
+    if (below := unit_of(found.units[index], [rule.si])) not in (None, unit):
+        unit, missing = None, f"the header says {unit}, the row of units {below}"
     by_name = named + MEANT_SCORE * meant if named or name == "force" else 0.0
     if by_name <= 0.0 or meant < 0:
         other = (constant and name not in kind.optional) or not (unit or named) or rule.si == "1"
@@ -618,7 +751,7 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     if unit is None and rule.si == "1":
         return by_name, ColumnGuess(index, "1", "likely", "a number without unit")
     if unit is None:
-        return by_name, ColumnGuess(index, UNKNOWN, "unsure", "the file states no unit")
+        return by_name, ColumnGuess(index, UNKNOWN, "unsure", missing)
     reason = said if unit == text else f"{said}, read as {unit}"
     return by_name + UNIT_SCORE, ColumnGuess(index, unit, "likely" if unit == "g_n" else "sure", reason)
 

@@ -19,10 +19,12 @@ from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.parameters import ROUNDING, TABLE_1, Parameter, Prior
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
-from capsule_id.rig.formats.raw import Layout, RawTable, TextFile
+from capsule_id.rig.formats.layouts import units_of_header
+from capsule_id.rig.formats.raw import Export, Layout, RawTable, TextFile
 from capsule_id.rig.formats.text import is_stamp
-from capsule_id.rig.guess import find_layout, fits_name, proposal
+from capsule_id.rig.guess import find_layout, fits_name, proposal, refuse_no_readings
 from capsule_id.rig.maps import (
+    LAYOUT,
     MAP_KEYS,
     apply_map,
     clock_of,
@@ -376,6 +378,8 @@ def read_tables(
         exports = {
             name: EXPORTS[suffix_of(file)](contents.pop(name), file, column_map.layout) for name, file in files.items()
         }
+        for export in exports.values():
+            refuse_no_readings(export, column_map.layout)
         parts = apply_map(entry, list(exports.values()), column_map)
         encodings = {name: export.encoding for name, export in exports.items()}
         for name, export in exports.items():
@@ -518,12 +522,19 @@ def _read_plain(node: Node, file: Path, content: bytes, kind: KindRule) -> RawTa
     try:
         raw = READERS[suffix](content, file)
         _check_names(raw.names, kind, partial(raw.error, None))
+        export = Export(file, (raw.names,), len(raw.names), raw.rows, raw.columns.__getitem__, raw.place, cells=list)
+        refuse_no_readings(export, Layout(columns=raw.names))
     except InputError as error:
-        if (error.line != 1 and not is_stamp(error.value.strip("'"))) or _A_TRIAL in error.remedy:
+        stamp = is_stamp(error.value.strip("'"))
+        keys = not stamp and any(f"{key} = " in error.remedy for key in LAYOUT)
+        if not (keys or stamp or error.line == 1) or _A_TRIAL in error.remedy:
             raise
-        proposed = _proposal(file, kind, Layout())
-        remedy = f"{error.remedy}; or add {proposed} to the experiment, and no other column is read"
-        raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
+        remedy = f"; or add {_proposal(file, kind, Layout())} to the experiment, and no other column is read"
+        if keys:
+            units = enumerate(units_of_header(TextFile(content, file))[1].items(), 1)
+            columns = ", ".join(f'{name} = {{ from = {k}, unit = "{unit}" }}' for k, (name, unit) in units)
+            remedy = f", in the experiment with columns = {{ {columns} }}"
+        raise InputError(error.rule, error.value, error.remedy + remedy, file, error.line, error.column) from None
     return raw
 
 

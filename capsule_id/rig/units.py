@@ -26,6 +26,7 @@ _DEFINITIONS = {
     "cm": "1e-2 * m",
     "km": "1e3 * m",
     "in": "0.0254 * m",
+    "mil": "2.54e-5 * m",
     "stamp": "1 * s",  # a date and a time of day, or one of them, as a column map reads it
     "ns": "1e-9 * s",
     "us": "1e-6 * s",
@@ -63,6 +64,7 @@ _NAMES = {
     "sec": "s", "second": "s", "msec": "ms", "millisecond": "ms", "usec": "us", "microsecond": "us", "nsec": "ns",
     "nanosecond": "ns", "minute": "min", "meter": "m", "metre": "m", "millimeter": "mm", "millimetre": "mm",
     "micron": "um", "micrometer": "um", "micrometre": "um", "centimeter": "cm", "centimetre": "cm", "inch": "in",
+    "mil": "mil", "thou": "mil",
     "inche": "in", "gram": "g", "gramme": "g", "kilogram": "kg", "kilo": "kg", "pound": "lb", "lb": "lb",
     "newton": "N", "amp": "A", "ampere": "A", "degree": "deg", "deg": "deg", "radian": "rad", "rad": "rad",
     "hertz": "Hz", "volt": "V", "millivolt": "mV", "sek": "s", "sekunden": "s", "seconde": "s", "segundo": "s",

@@ -104,20 +104,23 @@ PULLS = "1,2.76,1.27,6.30\n2,5.00,2.31,11.20\n3,7.73,3.24,16.10\n4,9.70,4.24,21.
     [
         (
             "Trial,Fmax,Fk,FN\n" + PULLS,
-            ['force = { from = "Fmax", unit = "?" }', 'normal_force = { from = "FN", unit = "?" }'],
+            ['columns.force = { from = "Fmax", unit = "?" }', 'columns.normal_force = { from = "FN", unit = "?" }'],
         ),
-        ("Trial,Fmax (N),Fk (N),FN (N)\n" + PULLS, ['force = { from = "Fmax (N)", unit = "N" }  # likely: ']),
-        ("Trial,Pull 1 (N),Pull 2 (N),FN (N)\n" + PULLS, [f'# force = {{ from = "Pull {k} (N)"' for k in (1, 2)]),
+        ("Trial,Fmax (N),Fk (N),FN (N)\n" + PULLS, ['columns.force = { from = "Fmax (N)", unit = "N" }  # likely: ']),
+        (
+            "Trial,Pull 1 (N),Pull 2 (N),FN (N)\n" + PULLS,
+            [f'# columns.force = {{ from = "Pull {k} (N)"' for k in (1, 2)],
+        ),
         ("Trial,Pull (N),Spare (N),FN (N)\n" + PULLS, ["'Spare (N)', fits less well"]),
         (
             "Angle (deg),Pull (N)\n20,3.1\n20,3.3\n20,3.2\n",
-            ['slope = { value = 20, unit = "deg" }  # unsure', 'force = { from = "Pull (N)"'],
+            ['slope = { value = 20, unit = "deg" }  # unsure', 'columns.force = { from = "Pull (N)"'],
         ),
-        ("Angle (deg)\n20\n20\n20\n", ['# angle = { from = "Angle (deg)", unit = "deg" }  # unsure']),
+        ("Angle (deg)\n20\n20\n20\n", ['# columns.angle = { from = "Angle (deg)", unit = "deg" }  # unsure']),
         ("Tilt (deg),Pull (N)\n20,3.1\n21,3.3\n24,3.2\n", ["# unsure: the columns fit angle and force"]),
         (
             "Pull (N),Kontakt (N)\n3.1,6\n3.3,7\n3.2,8\n",
-            ['# normal_force = { from = "Kontakt (N)", unit = "N" }  # unsure'],
+            ['# columns.normal_force = { from = "Kontakt (N)", unit = "N" }  # unsure'],
         ),
     ],
 )

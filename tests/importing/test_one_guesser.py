@@ -148,6 +148,6 @@ def test_a_trace_of_a_pull_is_no_table_of_pulls(tmp_path: Path, capsys: pytest.C
     assert "static_friction must be a table of trials, a record against time, read angle," in said
     (tmp_path / "rig" / "pull.csv").write_text("force [N]\n4.5\n4.4\n4.6\n", encoding="utf-8")
     toml = tmp_path / "rig" / "rig.toml"
-    entry = re.sub(r"\[experiment.columns\].*", "", toml.read_text(encoding="utf-8"), flags=re.DOTALL)
+    entry = re.sub(r"\ncolumns\..*", "", toml.read_text(encoding="utf-8"), flags=re.DOTALL)
     toml.write_text(entry, encoding="utf-8")  # the remedy: a row per trial
     assert cli.capsule_id(["check", str(tmp_path / "rig")]) == 0

@@ -71,7 +71,7 @@ def completed(text: str, units: Mapping[str, str]) -> str:
     """The masses stated, and each ``?`` filled with the unit of the column, or the frequency of the drive."""
     text = re.sub(r"^# (m[12] = )", r"\1", text, flags=re.MULTILINE)
     for name, unit in units.items():
-        text = re.sub(rf'^({name} = .*unit = )"\?"', rf'\1"{unit}"', text, flags=re.MULTILINE)
+        text = re.sub(rf'^(columns.{name} = .*unit = )"\?"', rf'\1"{unit}"', text, flags=re.MULTILINE)
     return text.replace('f = { value = "?"', "f = { value = 5.5")
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
+from capsule_id.rig.formats.layouts import read_csv
 from capsule_id.rig.formats.raw import NO_READING, TextFile
-from capsule_id.rig.formats.text import Shape, plain_block, read_csv, rows_of
+from capsule_id.rig.formats.text import Shape, plain_block, rows_of
 
 DIALECTS = [
     (delimiter, decimal, ending, mark)
@@ -34,7 +35,7 @@ def test_round_trip(delimiter: str, decimal: str, ending: str, mark: str, column
     rows = [delimiter.join(repr(float(cell)).replace(".", decimal) for cell in row) for row in values]
     if columns == 1 and decimal == ",":
         # A single header gives no evidence of semicolons: the comma separates cells.
-        with pytest.raises(InputError, match="a row must have 1 cell"):
+        with pytest.raises(InputError, match="a row must have 1 cell, as the header has, 2 cells"):
             read_csv(ending.join([mark + header, *rows]).encode(), Path("t.csv"))
         return
     table = read_csv(ending.join([mark + header, *rows, "", "  ", ""]).encode(), Path("t.csv"))

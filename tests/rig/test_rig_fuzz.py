@@ -13,8 +13,8 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
+from capsule_id.rig.formats.layouts import read_csv
 from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.formats.text import read_csv
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 
 MUTATIONS = 300

@@ -14,8 +14,8 @@ from capsule_id.experiments.kind import default_registry
 from capsule_id.rig import guess
 from capsule_id.rig.formats import EXPORTS, raw
 from capsule_id.rig.formats import text as texts
+from capsule_id.rig.formats.layouts import read_csv
 from capsule_id.rig.formats.raw import MOST_COLUMNS, NO_READING, Layout, TextFile
-from capsule_id.rig.formats.text import read_csv
 from capsule_id.rig.toml import DEEPEST_KEY, LARGEST_TEXT, closest, parse_toml
 from tests.cli_tools import small_rig
 
@@ -95,7 +95,9 @@ def test_a_rig_in_utf_16_is_read(tmp_path: Path) -> None:
         (folder / "rig.toml").write_bytes(mark + text.encode(codec))
         assert capsule_id.read_rig(folder).name == expected.name
     (folder / "rig.toml").write_bytes(text.encode("utf-16-le"))  # without its mark
-    with pytest.raises(InputError, match=r"the file must be text, a binary file \(NUL byte\), export it as text"):
+    with pytest.raises(
+        InputError, match=r"the file must be text, a binary file \(NUL byte\), export it as text, in UTF-8"
+    ):
         capsule_id.read_rig(folder)
 
 

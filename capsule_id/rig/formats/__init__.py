@@ -18,9 +18,8 @@ from capsule_id.rig.formats.binary import (
     read_tdms,
     read_xlsx,
 )
-from capsule_id.rig.formats.layouts import read_lvm, read_text
+from capsule_id.rig.formats.layouts import read_csv, read_lvm, read_text
 from capsule_id.rig.formats.raw import COMPRESSED, Export, Layout
-from capsule_id.rig.formats.text import read_csv
 
 
 def _unless_octave(read: Callable[[bytes, Path, Layout], Export], content: bytes, path: Path, layout: Layout) -> Export:
@@ -28,7 +27,10 @@ def _unless_octave(read: Callable[[bytes, Path, Layout], Export], content: bytes
     return (read_octave if content.startswith(OCTAVE) else read)(content, path, layout)
 
 
-TEXTS = {**dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), partial(_unless_octave, read_text)), ".lvm": read_lvm}
+TEXTS = {
+    **dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".log", ".asc"), partial(_unless_octave, read_text)),
+    ".lvm": read_lvm,
+}
 
 
 def suffix_of(path: Path) -> str:

@@ -14,10 +14,14 @@ from capsule_id.errors import InputError
 from capsule_id.rig.filters import FEWEST_SAMPLES
 from capsule_id.rig.formats.raw import (
     MOST_TITLES,
+    NO_READING,
     Export,
     Layout,
     Place,
+    RawTable,
     TextFile,
+    lines_of,
+    numbers_of,
     refuse_line,
     refuse_wide,
 )
@@ -26,7 +30,6 @@ from capsule_id.rig.formats.text import (
     COMMENTS,
     Shape,
     apart_marks,
-    are_words,
     bare,
     cells_of,
     is_comment,
@@ -38,6 +41,7 @@ from capsule_id.rig.formats.text import (
     texts_of,
 )
 from capsule_id.rig.toml import shown
+from capsule_id.views import counted
 
 # any layout: Reads text exports of any layout: titles, headers, rows of units, comments, and any separator.
 #
@@ -69,14 +73,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     _refuse_ambiguous_comma(file, first, delimiter, layout)
     for cell, position in cells_of(row, delimiter):
         if cell.count('"') % 2:  # rows such as "10,2","1,5": the separator would cut quoted numbers in two
-            raise InputError(
-                "a cell in quotation marks must not hold the separator of the cells",
-                shown(row.strip()),
-                "export with a decimal point, or with semicolons between the cells",
-                file.path,
-                first + 1,
-                position,
-            )
+            rule = "a cell in quotation marks must not hold the separator of the cells"
+            remedy = "export with a decimal point, or with semicolons between the cells"
+            raise InputError(rule, shown(row.strip()), remedy, path, first + 1, position)
     *cells, last = texts_of(row, delimiter)
     blank = bool(cells) and not last
     trailing = blank and all(not texts_of(line, delimiter)[-1] for line in file.lines(first) if is_row(line))
@@ -95,7 +94,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     )
     columns = zip(*(cells for cells in first_rows if len(cells) >= width), strict=False)
     # The reader in C takes every mark for the decimal one.
-    quick = are_words(layout.missing) and (decimal is not None or not apart_marks([*columns], layout.missing, None))
+    quick = not numbers_of(layout.missing) and (
+        decimal is not None or not apart_marks([*columns], layout.missing, None)
+    )
     rows = rows_of(file, shape, wanted, None, words) if quick else None
     stated = decimal is not None and layout.decimal == decimal
     rows = rows or rows_of(file, replace(shape, decimal=decimal, stated=stated), wanted, layout.missing, words)
@@ -106,7 +107,8 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    return Export(path, headers, width, lines, rows.column, place, file.encoding, rows.words)
+    texts, every = rows.words, lambda: (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
+    return Export(path, headers, width, lines, rows.column, place, file.encoding, texts, cells=every)
 
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
@@ -157,7 +159,7 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
         raise InputError(
             f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
             "none",
-            "export the readings as text, or state data_from_line",
+            "export the readings as numbers, a row in each line",
             file.path,
             1 if layout.data_from_line is None else len(lines),
             1,
@@ -257,6 +259,79 @@ def is_number(cell: str) -> bool:
 def _is_reading(cell: str, layout: Layout) -> bool:
     """Whether a cell is a number, a time stamp, or a stated missing marker."""
     return is_number(cell) or cell in layout.missing or is_stamp(cell)
+
+
+# csv: Reads CSV tables: a header ``name [unit]`` per column, then rows of numbers as any text export has them.
+
+
+_HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
+
+
+def read_csv(content: bytes, path: Path) -> RawTable:
+    """Read a CSV table; rows with a missing cell (``NO_READING``) are left out.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+
+    Raises
+    ------
+    InputError
+        Naming line and column of the first fault.
+    """
+    file = TextFile(content, path)
+    mark, units = units_of_header(file)
+    blocks = ((number, block) for number, block in file.blocks(1) if re.search(rb'["#%]', block))
+    for line, row in ((number + k, row) for number, block in blocks for k, row in enumerate(lines_of(block), 1)):
+        quoted = (each for each in cells_of(row, mark) if '"' in each[0] and bare(each[0]) not in NO_READING)
+        for cell, column in [(row.strip(), 1)] if is_comment(row) else quoted:  # a mark may be left of a damaged cell
+            remedy = "remove comments and quotation marks from the table"
+            raise InputError("a row must be numbers", shown(cell), remedy, path, line, column)
+    line, row = next(((k, row) for k, row in enumerate(file.lines(1), 2) if is_row(row)), (1, ""))
+    if not row:
+        raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
+    if (width := len(texts_of(row, mark))) != len(units):
+        rule, found = f"a row must have {counted(len(units), 'cell')}, as the header has", counted(width, "cell")
+        place = place_of_cell(row, mark, len(units), len(row) + 1)
+        raise InputError(rule, found, "correct the row, or the header", path, line, place)
+    layout = Layout(line, missing=NO_READING, decimal="." if mark == "," and width > 1 else None)
+    export = read_text(content, path, layout)
+    empty = [np.full(len(export.lines), np.nan)] * (width - export.width)  # every last cell is
+    columns = (*map(export.values, range(export.width)), *empty)
+    raw = RawTable(tuple(units), tuple(units.values()), columns, export.lines, export.place, export.encoding)
+    missing = np.any(np.isnan(columns), axis=0)
+    if missing.all():  # the first cell of the first row that holds none
+        here = raw.place(0, int(np.argmax([np.isnan(column[0]) for column in columns])))
+        remedy = "write a number; a table must have a row without missing cells"
+        raise InputError("a cell must not be empty", "nothing", remedy, *here)
+    return replace(raw.taken(np.flatnonzero(~missing)), lost=export.lines[missing])
+
+
+def units_of_header(file: TextFile) -> tuple[str, dict[str, str]]:
+    """Separator of a CSV table, and the units of its columns by name.
+
+    Raises
+    ------
+    InputError
+        At the first cell of the first line that is no header ``name [unit]``.
+    """
+    units, line = dict[str, str](), file.line(0)
+    mark = next((mark for mark in "\t;," if mark in line), ",")
+    refuse_wide(line.count(mark) + 1, file.path, 1)
+    for cell, column in cells_of(line, mark):
+        found = _HEADER_CELL.fullmatch(bare(cell).strip())
+        if found is None or not found[2].strip():
+            rule, remedy = (
+                "the first line must be headers `name [unit]`",
+                "head each column `name [unit]`, e.g. `time [s]` ([1]: no unit)",
+            )
+            raise InputError(rule, shown(bare(cell)), remedy, file.path, 1, column)
+        if found[1] in units:
+            twice = f"a second {found[1]}", "remove or rename it"
+            raise InputError("column names must be unique", *twice, file.path, 1, column)
+        units[found[1]] = found[2].strip()
+    return mark, units
 
 
 # lvm: Reads LabVIEW measurement files (``.lvm``): a header of the file, then segments with a header and rows of
@@ -402,13 +477,21 @@ def _take_apart(text: TextFile) -> tuple[str, dict[str, list[str]], list[_Segmen
         keys, first = header(stop, number), number + 2
         segments.append(_Segment(keys, tuple(found), first, stop := first + len([*rows])))
     names = {segment.names for segment in segments}
+    labels = {" ".join(segment.keys.get("Y_Unit_Label", ())).strip(): segment.first for segment in segments}
+    units = {text: number for text, number in labels.items() if text}
     for holds, rule, number in (
         (end, f"a .lvm file must have a header that ends with {_END}", 1),
         *((one.stop > one.first, "a segment must have rows", one.first) for one in segments),
         (len(names) < 2, "segments must have the same columns", stop),
+        (
+            len(units) < 2,
+            f"segments must have the same units, not {' and '.join(units)}",
+            max(labels.values(), default=1),
+        ),
         (not header(stop, len(lines)), f"a header must end with {_END}", stop + 1),
         (min(map(len, names), default=0) > 1, "a LabVIEW measurement file must have a segment with channels", stop),
     ):
         if not holds:
-            raise InputError(rule, shown(lines[number - 1]), _REMEDY, text.path, number, 1)
+            remedy = "export a file of each segment" if rule.startswith("segments") else _REMEDY
+            raise InputError(rule, shown(lines[number - 1]), remedy, text.path, number, 1)
     return separator, header(0, end), segments

@@ -5,7 +5,7 @@ import gzip
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -226,7 +226,10 @@ def _encoding(raw: bytes, path: Path) -> str:
     InputError
         At the first byte that is no text.
     """
-    rule, binary = "the file must be text", ("a binary file (NUL byte)", "export it as text")
+    rule, binary = (
+        "the file must be text",
+        ("a binary file (NUL byte)", "export it as text, in UTF-8"),
+    )
     marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if not marked and (nul := raw.find(b"\0")) >= 0:
         raise InputError(rule, *binary, path, *place_of_byte(raw[:nul], "utf-8"))
@@ -260,6 +263,7 @@ def place_of_byte(before: bytes, codec: str = "utf-8") -> tuple[int, int]:
 # raw: A table as written: numbers in the units of the file, and the place of each cell.
 
 
+_CODE = r"[+-]?[0-9]+(?:[.,][0-9]*)?(?:[eE][+-]?[0-9]+)?"
 #: Texts of cells without a reading.
 NO_READING = tuple(
     dict.fromkeys(
@@ -268,6 +272,12 @@ NO_READING = tuple(
         for text in (word, word.lower(), word.upper(), word.capitalize())
     )
 )
+
+
+def numbers_of(markers: Iterable[str]) -> list[float]:
+    """The missing markers that are numbers, such as -999 or 99,99."""
+    return [float(text.replace(",", ".")) for text in markers if re.fullmatch(_CODE, text)]
+
 
 Place = tuple[Path, int, int]  #: file, and 1-based line and column, of a cell
 
@@ -327,7 +337,8 @@ class Layout:
     ----------
     data_from_line, data_to_line : 1-based lines of the first and the last row of numbers (None: the first line that holds
         a number, and the last line of the file)
-    missing : texts of cells without a reading, such as ``--`` or ``NaN``; a column map adds ``NO_READING``
+    missing : texts of cells without a reading, such as ``--`` or ``NaN``, and numbers that stand for none, such as -999;
+        a column map adds ``NO_READING``
     decimal : decimal mark of a text table, "." or "," (None: found in the file)
     columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
     words : headers, or numbers counted from 1, of those whose texts it keeps too
@@ -361,6 +372,7 @@ class Export:
     encoding : of a text
     words : index of a column that ``Layout.words`` names -> (rows,) its texts; None: the format has no texts
     sheet, others : names of the sheet of a workbook that was read, "" of another format, and of others with numbers
+    cells : the texts of each row of a text or a sheet, read or not; None: the format has no such rows
     """
 
     path: Path
@@ -373,6 +385,7 @@ class Export:
     words: Callable[[int], np.ndarray] | None = None
     sheet: str = ""
     others: tuple[str, ...] = ()
+    cells: Callable[[], Iterable[list[str]]] | None = None
 
 
 # arrays: Makes an export of named arrays: the form of every format without lines.
@@ -448,6 +461,7 @@ def export_of_arrays(arrays: Mapping[str, np.ndarray], path: Path, layout: Layou
                 'add "NaN" to missing = [...] to drop its row' if np.isnan(found[row]) else "correct the value",
                 *place(row, column),
             )
+        found[np.isin(found, numbers_of(layout.missing))] = np.nan
         return found
 
     def place(row: int | None, column: int) -> Place:

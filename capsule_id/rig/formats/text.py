@@ -1,4 +1,4 @@
-"""Readers of text tables: cells, rows of numbers, CSV."""
+"""Readers of text tables: cells, time stamps, rows of numbers."""
 
 import io
 import json
@@ -7,14 +7,19 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import NO_READING, Place, RawTable, TextFile, lines_of, refuse_wide
+from capsule_id.rig.formats.raw import (
+    Place,
+    TextFile,
+    lines_of,
+    numbers_of,
+)
 from capsule_id.rig.toml import shown
 from capsule_id.views import counted
 
@@ -340,11 +345,6 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     return values[:, np.searchsorted(used, columns)] if exact else None
 
 
-def are_words(missing: Sequence[str]) -> bool:
-    """Whether no missing marker is a number, such as -999: the reader in C would take it for a reading."""
-    return all(number_in(marker, mark) is None for marker in missing for mark in ".,")
-
-
 def rows_of(
     file: TextFile,
     shape: Shape,
@@ -362,8 +362,8 @@ def rows_of(
         If a row has another number of cells than the first one.
     """
     rows = Rows({column: [] for column in columns}, {column: [] for column in words})
-    markers, marks = missing or (), dict.fromkeys(columns, shape.decimal)
-    alone, apart = not words and are_words(markers), None
+    markers, marks, codes = missing or (), dict.fromkeys(columns, shape.decimal), numbers_of(missing or ())
+    alone, apart = not words and not codes, None  # the reader in C would take a code for a reading
     for number, block in file.blocks(shape.first):
         # No other decimal mark than that of the reader in C can be meant.
         plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
@@ -400,7 +400,8 @@ def rows_of(
             try:
                 if mark is None:
                     raise _ambiguous(texts, turned, place)
-                rows.numbers[column].append(read_column(texts, marks[column] or ".", markers, place))
+                found = read_column(texts, marks[column] or ".", markers, place)
+                rows.numbers[column].append(np.where(np.isin(found, codes), np.nan, found) if codes else found)
             except InputError as error:
                 rows.faults[column] = error
     return rows
@@ -434,7 +435,7 @@ def apart_marks(columns: Sequence[Sequence[str]], missing: Sequence[str], decima
     for k, texts in enumerate(columns):
         mark = decimal_mark(texts := [bare(text) for text in texts], missing)
         marked = [text for text in texts if mark and mark in text]
-        if mark and number_in(marked[0], mark) is not None:  # a date shows no decimal mark
+        if mark and marked and number_in(marked[0], mark) is not None:  # a date shows no decimal mark
             marks[k] = mark
             if all((found := _GROUPED.fullmatch(text)) and text[-4] == found["mark"] for text in marked):
                 # 2.501 is no number of a few beside -930 in its column.
@@ -466,106 +467,3 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
             place_of_cell(text, shape.delimiter, shape.width, len(text) + 1),
         )
     return cells
-
-
-# csv: Reads CSV tables: a header ``name [unit]`` per column, then a row of numbers per line.
-#
-# Cells are separated by comma, semicolon or tab. The decimal mark is a point, or a comma if commas do not separate
-# cells.
-# A reader in C reads the rows block by block. If it fails, the cells are read one by one to locate the first fault.
-# Places are
-# 1-based: the line of the file, and the character of that line at which the cell begins.
-
-
-_HEAD = "head each column `name [unit]`"
-_BLANK = ("lines between the first and the last must not be blank", "a blank line", "remove the line")
-_HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
-
-
-def read_csv(content: bytes, path: Path) -> RawTable:
-    """Read a CSV table; rows with a missing cell (``NO_READING``) are left out.
-
-    Parameters
-    ----------
-    content : the bytes of the file
-    path : its name, for error lines
-
-    Raises
-    ------
-    InputError
-        Naming line and column of the first fault.
-    """
-    file = TextFile(content, path)
-    header = file.line(0)
-    if not header.strip():
-        empty = ("a table must not be empty", "no text at all", f"{_HEAD} and write a row per reading")
-        raise InputError(*(_BLANK if any(line.strip() for line in file.lines()) else empty), path, 1, 1)
-    delimiter = next((mark for mark in "\t;," if mark in header), ",")
-    refuse_wide(header.count(delimiter) + 1, path, 1)
-    names, units = _header(header, delimiter, path)
-    marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
-    decimal = next((mark[0] for mark in marks if mark), ".")
-    shape = Shape(1, delimiter, len(names), decimal)
-    quoted = [
-        (cell, number + k + 1, column)
-        for number, block in file.blocks(1)
-        if b'"' in block
-        for k, text in enumerate(lines_of(block))
-        for cell, column in cells_of(text, delimiter)
-        if '"' in cell and bare(cell) not in NO_READING and is_row(text)
-    ]
-    for cell, *where in quoted:  # a mark may be left of a damaged cell
-        raise InputError("a cell must be a number", shown(cell), "remove the quotation marks", path, *where)
-    rows = rows_of(file, shape, range(len(names)), NO_READING)
-    assert rows is not None, "any cell is read with a list of markers"
-    lines, empty = rows.lines, _lines_without_cells(file, rows.lines)
-
-    def place(row: int | None, column: int) -> Place:
-        line = 0 if row is None else int(lines[row]) - 1
-        return path, line + 1, place_of_cell(file.line(line), delimiter, column)
-
-    raw = RawTable(names, units, tuple(map(rows.column, range(len(names)))), lines, place, file.encoding)
-    missing = np.any(np.isnan(raw.columns), axis=0)
-    if missing.all():  # the first cell of the first row that holds none
-        here = raw.place(0, int(np.argmax([np.isnan(column[0]) for column in raw.columns])))
-        remedy = "write a number; a table must have a row without missing cells"
-        raise InputError("a cell must not be empty", "nothing", remedy, *here)
-    lost = np.sort(np.append(lines[missing], empty).astype(int))
-    return replace(raw.taken(np.flatnonzero(~missing)), lost=lost) if len(lost) else raw
-
-
-def _lines_without_cells(file: TextFile, rows: np.ndarray) -> list[int]:
-    """1-based lines, besides the ``rows`` of a table, that hold separators alone.
-
-    Raises
-    ------
-    InputError
-        If there are no rows, at a comment, or at a blank line above the last row.
-    """
-    if not len(rows):
-        raise InputError("a table must have rows", "a header only", "add a row per reading", file.path, 1, 1)
-    if len(rows) == sum(text.count(b"\n") for _, text in file.blocks(1)):
-        return []
-    known = {*rows.tolist()}
-    others = [(number, text.strip()) for number, text in enumerate(file.lines(1), 2) if number not in known]
-    for number, text in others:
-        comment = ("a row must be numbers", shown(text), "remove comments from the table")
-        if is_comment(text) or (not text and number < rows[-1]):
-            raise InputError(*(comment if text else _BLANK), file.path, number, 1)
-    return [number for number, text in others if text]
-
-
-def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and units of the columns."""
-    units: dict[str, str] = {}
-    remedy = f"{_HEAD}, e.g. `time [s]` ([1]: no unit)"
-    for cell, column in cells_of(line, delimiter):
-        found = _HEADER_CELL.fullmatch(bare(cell).strip())
-        if found is None or not found[2].strip():
-            raise InputError("the first line must be headers `name [unit]`", shown(bare(cell)), remedy, path, 1, column)
-        if found[1] in units:
-            raise InputError(
-                "column names must be unique", f"a second {found[1]}", "remove or rename it", path, 1, column
-            )
-        units[found[1]] = found[2].strip()
-    return tuple(units), tuple(units.values())
