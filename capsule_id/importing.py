@@ -14,7 +14,9 @@ from capsule_id.experiments.kind import Kind, default_registry
 from capsule_id.records.release import find_free_decay, find_releases
 from capsule_id.records.tones import estimate_clock, frequency_of
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
-from capsule_id.rig.formats.raw import NO_READING
+from capsule_id.rig.formats import TEXTS
+from capsule_id.rig.formats.layouts import delimiter_of
+from capsule_id.rig.formats.raw import NO_READING, TextFile
 from capsule_id.rig.guess import (
     TIME,
     Assignment,
@@ -269,6 +271,7 @@ _DECIMALS = {
     ".": "the header has a name for every number between commas",
     ",": "one column with a comma in every number",
 }
+_SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "spaces"}
 
 
 def dimensions_of(kinds: Mapping[str, Kind]) -> tuple[str, ...]:
@@ -334,18 +337,18 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
     guessed, others = guess(found, kinds), found.export.others
     if others:
         found = replace(found, layout=replace(found.layout, sheet=found.export.sheet))
-    entries = [_entry(found, guessed, kinds)]
+    entries = [_entry(found, guessed, content, kinds)]
     for sheet in others:
         try:
             other = find_layout(content, path, dimensions, sheet)
         except InputError as error:
             entries.append(f"#: Sheet {sheet!r} is not read: {error.rule}, {' '.join(error.value.split())}.\n")
         else:
-            entries.append(_entry(other, guess(other, kinds), kinds))
+            entries.append(_entry(other, guess(other, kinds), content, kinds))
     return "\n".join(entries), guessed
 
 
-def _entry(found: FoundLayout, guessed: Guess | None, kinds: Mapping[str, Kind]) -> str:
+def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Mapping[str, Kind]) -> str:
     """The lines of ``[[experiment]]`` for an export with its guess."""
     unread, file = list(_unread_lines(found, dimensions_of(kinds))), found.export.path.name
     if guessed is None:
@@ -373,7 +376,7 @@ def _entry(found: FoundLayout, guessed: Guess | None, kinds: Mapping[str, Kind])
     kind = kinds[guessed.kind]
     lines = [*unread, *_unused_lines(found, guessed, kind)]
     lines += ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
-    lines += [_commented(f"file = {json.dumps(file)}", "sure", counted(len(found.export.lines), "row"))]
+    lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found)
     lines += [
         _commented(line, "unsure" if UNKNOWN in line else "likely", why) for line, why in lines_of_labels(found, kind)
@@ -413,6 +416,15 @@ def _unused_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
 def _commented(line: str, confidence: str, reason: str) -> str:
     """A line with the confidence of its guess as a comment."""
     return f"{line}  # {confidence}: {' '.join(reason.split())}"
+
+
+def _description(found: FoundLayout, content: bytes) -> str:
+    """Rows and separator of a file in words."""
+    text = counted(len(found.export.lines), "row")
+    if found.export.path.suffix.lower() not in TEXTS:
+        return text
+    line = TextFile(content, found.export.path).line(int(found.export.lines[0]) - 1)
+    return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
 
 
 def _layout_lines(found: FoundLayout) -> Iterable[str]:
