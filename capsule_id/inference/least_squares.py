@@ -56,8 +56,8 @@ class LeastSquaresFit:
     x: np.ndarray
     cost: np.ndarray
     stalled: np.ndarray
-    residuals: tuple[Residuals, ...]
-    jacobian: tuple[Jacobian, ...]
+    residuals: tuple[Any, ...]
+    jacobian: tuple[Any, ...]
 
 
 @dataclass(frozen=True)
