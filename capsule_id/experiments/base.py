@@ -539,10 +539,13 @@ def estimate(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[i
     freedom = max(len(keep) - len(symbols) - nuisances, 1)
     # A model that is not finite (an overdamped decay) determines nothing.
     finite = bool(np.isfinite(solution.jac).all())
-    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) if finite else np.full((len(at), len(at)), np.inf)
+    # In columns of unit length: a pseudo-inverse gives no variance to a parameter of little effect beside another.
+    unit = np.maximum(np.linalg.norm(solution.jac, axis=0), np.finfo(float).tiny) if finite else np.ones(len(at))
+    scaled = solution.jac / unit
+    variances = np.diag(np.linalg.pinv(scaled.T @ scaled)) / unit**2 if finite else np.full(len(at), np.inf)
     values = values_of(solution.x)
     # Rounding may leave a variance of no positive value, where two parameters have the same effect.
-    variances = np.where(np.diag(covariance) > 0.0, np.diag(covariance), np.inf)
+    variances = np.where(variances > 0.0, variances, np.inf)
     errors = np.where(np.isfinite(variances), np.abs(at if signed else values), 1.0) * np.sqrt(variances)
     return Refit(
         {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)},

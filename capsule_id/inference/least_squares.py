@@ -49,15 +49,15 @@ class LeastSquaresFit:
     cost : (s,) ½ Σ r², units of the residuals squared
     stalled : (s,) bool, no convergence: too many steps, non-finite values, or vanishing steps away from a stationary
         point
-    residuals : (s, n) at the end points
-    jacobian : (s, n, d) of the residuals at the end points
+    residuals : (n,) at each end point
+    jacobian : (n, d) of the residuals at each end point
     """
 
     x: np.ndarray
     cost: np.ndarray
     stalled: np.ndarray
-    residuals: np.ndarray
-    jacobian: np.ndarray
+    residuals: tuple[Any, ...]
+    jacobian: tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,13 @@ def least_squares(linearise: Linearise, starts: np.ndarray, solver: Solver = SOL
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
     descent = partial(_descend, linearise, solver=solver)
-    # The first start compiles the programs that all threads then call.
-    ends = [descent(starts[0]), *pool().map(descent, starts[1:])]
-    x, residuals, jacobian, stalled = (np.stack(part) for part in zip(*ends, strict=True))
-    return LeastSquaresFit(x, 0.5 * np.sum(residuals**2, axis=1), stalled, residuals, jacobian)
+    # The first start compiles the programs that all threads then call. Many residuals would take the memory of each.
+    first = descent(starts[0])
+    ends = [first, *(map if len(first[1]) > HEAVY else pool().map)(descent, starts[1:])]
+    x, residuals, jacobian, stalled = zip(*ends, strict=True)
+    return LeastSquaresFit(
+        np.stack(x), np.array([0.5 * np.sum(r**2) for r in residuals]), np.stack(stalled), residuals, jacobian
+    )
 
 
 def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> tuple[np.ndarray, Residuals, Jacobian, bool]:

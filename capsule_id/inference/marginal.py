@@ -186,7 +186,7 @@ FARTHEST_WITH_KINKS = 20.0
 EMULATED_NODES, EMULATED_ERROR, PLACES = (16, 32, 64, 128), 0.02, 512
 
 
-#: Rows that are evaluated together where each takes more than ``HEAVY`` work: more would leave the caches.
+#: Rows that are evaluated together where each takes ``HEAVY`` work, and fewer of more work: more would leave the caches.
 ROWS_TOGETHER = 8
 
 
@@ -447,8 +447,9 @@ def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: 
     of_row = partial(_conditional, layout, target, bend)
     if target.work < HEAVY:
         return jax.vmap(of_row)(v, start, step)
+    together = max(ROWS_TOGETHER * HEAVY // target.work, 1)
     # JAX joins no batches of outputs without elements, which a target without scatters has.
-    return jax.lax.map(lambda row: of_row(*row), (v, start, step), batch_size=ROWS_TOGETHER if layout.scatter else None)
+    return jax.lax.map(lambda row: of_row(*row), (v, start, step), batch_size=together if layout.scatter else None)
 
 
 def _conditional(

@@ -235,8 +235,13 @@ def root_of_covariance(target: LogPosterior, u: Vector, jacobian: Jacobian) -> t
     whitening = np.diag(np.maximum(count, 1e-2) ** -0.5)
     triangle = np.linalg.qr(np.nan_to_num(jacobian, posinf=0.0, neginf=0.0), mode="r")
     whitening[np.ix_(located, located)] = solve_triangular(triangle, np.eye(len(located)))
-    terms, zero = terms_of(target), np.zeros(len(u))
-    curvature = hessian(lambda w: terms(u + w @ whitening.T), zero, zero + 1.0, np.flatnonzero(target.integrated))
+    terms, zero, alone = terms_of(target), np.zeros(len(u)), np.flatnonzero(target.integrated)
+    curvature = hessian(lambda w: terms(u + w @ whitening.T), zero, zero + 1.0, alone)
+    # Reading errors may hide a scatter from any number of readings: its prior alone then gives its curvature.
+    hidden = target.scatter & (-np.diag(curvature) < FLATTEST)
+    if np.any(hidden):
+        whitening[hidden, hidden] = target.prior_sd[hidden]
+        curvature = hessian(lambda w: terms(u + w @ whitening.T), zero, zero + 1.0, alone)
     # Away from a maximum a direction may have no positive curvature; there Gauss-Newton's stands.
     values, vectors = np.linalg.eigh(np.nan_to_num(-curvature, nan=0.0, posinf=0.0, neginf=0.0))
     return whitening, vectors / np.sqrt(np.where(values > FLATTEST, values, 1.0))

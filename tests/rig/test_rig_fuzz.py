@@ -126,15 +126,15 @@ TABLE = b"time [s],x_rel [mm]\n" + b"".join(b"%.2f,%.3f\n" % (0.01 * k, 1.5 + 0.
 
 
 def by_hand(content: bytes) -> list[list[float]]:
-    """The numbers of a table that was read, by Python's own means."""
+    """The numbers of a table that was read, by Python's own means; rows with a missing reading are left out."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = content.decode("cp1252")
     head, *lines = re.split("\r\n?|\n", text)
     mark = next((mark for mark in "\t;," if mark in head), ",")
-    cells = [line.split(mark) for line in lines if line.strip()]
-    return [[float(cell.replace(",", ".")) for cell in row] for row in cells]
+    cells = [[cell.strip('" ') for cell in line.split(mark)] for line in lines if line.strip()]
+    return [[float(cell.replace(",", ".")) for cell in row] for row in cells if not {"", "nan"} & set(row)]
 
 
 def kind_of_end(read: Callable[[bytes, Path], RawTable], content: bytes) -> str:

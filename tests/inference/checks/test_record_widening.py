@@ -11,12 +11,14 @@ import pytest
 from capsule_id.experiments.forced_run.drives import BaseRun
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.models import decay
+from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.checks import verdict
 from capsule_id.inference.checks.verdict import (
     FEWEST_PARTS,
     PRIORS,
     by_phase,
     by_time,
+    estimates_of_parts,
     parts_of_residuals,
     record_widenings,
     steps_of_parts,
@@ -29,6 +31,7 @@ from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.experiments import test_base_run as shaken
 from tests.inference.stub import plain_jacobian, plain_residuals
+from tests.measured.folders import Entry, make_rig, quantity
 
 NO_ARRAY = np.zeros(0)
 
@@ -202,3 +205,23 @@ def test_a_failed_check_widens_the_parameters_of_a_decay_with_dry_friction(monke
     assert wide["k1"].factor > 3.0
     assert wide["k1"].parts >= FEWEST_PARTS
     assert set(wide) <= {"k1", "c", "F_dry"}
+
+
+def test_parts_of_noise_alone_determine_nothing(tmp_path: Path) -> None:
+    """Before: c of such a part was 1e-10 with an sd of 1e-20, or its k1 7e-6 N/m, and c of 50 clean decays got no number."""
+    rng, t = np.random.default_rng(3), np.linspace(0.0, 0.3, 400)
+    omega, rate = np.sqrt(1422.0 / 0.11), 3.88 / (2.0 * 0.11)
+    damped, entries = np.sqrt(omega**2 - rate**2), []
+    for i in range(17):
+        size = rng.uniform(1.5, 3.0)
+        x = np.exp(-rate * t) * (np.cos(damped * t) + rate / damped * np.sin(damped * t))
+        columns = {"time [s]": np.round(t, 7), "x_rel [mm]": np.round(size * x + rng.normal(0.0, 0.01, 400), 5)}
+        entries.append(Entry("free_vibration", f"d{i}", columns))
+    rig = make_rig(tmp_path, *(entries[i] for i in (9, 16)), head={"m1": quantity(0.11, "kg", 0.0005)})
+    experiments = make_experiments(rig)
+    target = LogPosterior(rig, experiments)
+    values = {name: start.centre for name, start in target.starts().items()} | dict(target.fixed)
+    values |= {"k1": 1422.0, "c": 3.88}
+    found = [(values[name], pair) for e in experiments for name, pair in estimates_of_parts(e, values, 8)]
+    assert len(found) > 8
+    assert all(abs(value - truth) < 30.0 * sd for truth, (value, sd) in found)

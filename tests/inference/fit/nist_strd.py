@@ -242,7 +242,7 @@ def best_of(fit: LeastSquaresFit) -> int:
 def residual_sd_of(fit: LeastSquaresFit, start: int | None = None) -> float:
     """Estimate of the sd of the residuals at the end of ``start``, by default the best one."""
     index = best_of(fit) if start is None else start
-    _, n, d = fit.jacobian.shape
+    n, d = fit.jacobian[index].shape
     return float(np.sqrt(2.0 * fit.cost[index] / (n - d)))
 
 

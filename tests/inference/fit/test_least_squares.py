@@ -1,5 +1,7 @@
 """The solver against closed forms, SciPy and repeated experiments, and what it reports when there is no answer."""
 
+import threading
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,8 @@ import scipy.optimize
 from jax.tree_util import Partial
 
 from capsule_id.inference.curvature import covariance
-from capsule_id.inference.least_squares import LeastSquaresFit, Solver, _stationary
+from capsule_id.inference.least_squares import LeastSquaresFit, Solver, _stationary, least_squares
+from capsule_id.inference.target import HEAVY
 from tests.inference.fit.nist_strd import PROBLEMS, best_of, covariance_of, errors_of, residual_sd_of, solve
 
 RAT43 = next(problem for problem in PROBLEMS if problem.name == "Rat43")
@@ -75,6 +78,21 @@ def test_starts_at_or_near_zero() -> None:
     fit = solve(Partial(_decay_residual, _decay(DECAY_TRUTH)), starts)
     assert not fit.stalled.any()
     np.testing.assert_allclose(fit.x, np.tile(DECAY_TRUTH, (4, 1)), rtol=1e-7)
+
+
+@pytest.mark.parametrize(("n", "one"), [(20, False), (HEAVY + 1, True)])
+def test_starts_of_many_residuals_take_the_memory_of_one(n: int, one: bool) -> None:
+    """Before: 100,000 pushes took 200 MB in the threads of the starts."""
+    callers = set[int]()
+    slope = np.linspace(0.0, 1.0, n)[:, None]
+
+    def linearise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        callers.add(threading.get_ident())
+        return slope @ x - 1.0, slope
+
+    fit = least_squares(linearise, np.arange(1.0, 6.0)[:, None])
+    np.testing.assert_allclose(fit.x, np.sum(slope) / np.sum(slope**2), rtol=1e-7)
+    assert (callers == {threading.get_ident()}) == one
 
 
 def test_tiny_steps_away_from_a_minimum_are_not_convergence() -> None:

@@ -1,6 +1,7 @@
 """The point fit against SciPy on the same readings, its standard errors, and starts that cannot agree."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from capsule_id.inference.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.synthetic import Truth, synthesize
+from tests.measured.folders import Entry, make_rig, quantity
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +37,18 @@ def test_all_starts_agree(fit: PointFit) -> None:
     assert fit.agree
     assert not fit.stalled.any()
     assert np.ptp(fit.log_posterior) < 1e-3
+
+
+def test_starts_agree_where_errors_of_many_readings_hide_the_scatter(tmp_path: Path) -> None:
+    """Before: its sd was that of 2n readings that show it, and ends 0.005 of its logarithm apart "did not agree"."""
+    angle = 33.0 + 0.5 * np.random.default_rng(3).standard_normal(60_000)
+    tilts = Entry("static_friction", "tilt", {"angle [deg]": angle}, {"angle_sd": quantity(0.502, "deg")})
+    rig = make_rig(tmp_path, tilts)
+    target = LogPosterior(rig, make_experiments(rig))
+    fit = point_fit(target, seed=0)
+    sd = np.sqrt(np.diag(fit.covariance))[target.scatter]
+    assert fit.agree
+    assert 0.1 < sd < 1.0  # of a logarithm; 0.003 = 120,000^-0.5 before
 
 
 def test_it_is_a_maximum(twin: LogPosterior, fit: PointFit) -> None:
