@@ -301,6 +301,8 @@ def lint_line(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 
 #: Smallest deviation of the levels from the line that counts, in sd of the repeated readings.
 SMALLEST_DEVIATION = 0.5
+#: Coefficients of a parabola: fewer levels show no curvature of a line, and as many rows no error of one.
+OF_PARABOLA = 3
 #: Fewest rows of loading and of unloading that are compared.
 FEWEST_OF_A_BRANCH = 4
 
@@ -346,7 +348,7 @@ def lack_of_fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
     level = np.concatenate([[0], np.cumsum(np.diff(x[order]) > SAME * np.ptp(x))])
     count = np.bincount(level)
     levels, freedom = len(count), len(x) - len(count)
-    if levels < 3 or freedom < 3:
+    if levels < OF_PARABOLA or freedom < 3:
         return None
     mean = np.bincount(level, y[order]) / count
     within = float(np.sum((y[order] - mean[level]) ** 2)) / freedom
@@ -419,10 +421,10 @@ def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
 def curvature_test(x: np.ndarray, y: np.ndarray, sd: np.ndarray, scale_known: bool) -> tuple[float, float]:
     """Test readings y (n,) with errors ``sd`` for curvature: relative deviation of the best parabola at mid range, p-value."""
     z = (x - np.mean(x)) / (np.ptp(x) or 1.0)
-    if len(x) < 4 or len(np.unique(np.round(z, 9))) < 3:
+    if len(x) <= OF_PARABOLA or len(np.unique(np.round(z, 9))) < OF_PARABOLA:
         return 0.0, 1.0
     coefficients, covariance = np.polyfit(z, y, 2, w=1.0 / sd, cov="unscaled" if scale_known else True)
-    p = _p_of(coefficients[0], covariance[0, 0], np.inf if scale_known else len(x) - 3)
+    p = _p_of(coefficients[0], covariance[0, 0], np.inf if scale_known else len(x) - OF_PARABOLA)
     return float(coefficients[0] * 0.25 / abs(coefficients[1])), p
 
 
@@ -431,7 +433,7 @@ def origin_test(x: np.ndarray, y: np.ndarray, sd: np.ndarray, scale_known: bool)
 
     Also return the slope at the origin of a parabola through it, where that fits better than the line.
     """
-    if len(x) < 4:
+    if len(x) <= OF_PARABOLA:
         return 0.0, 1.0, None
     line, covariance = np.polyfit(x, y, 1, w=1.0 / sd, cov="unscaled")
     parabola = np.linalg.lstsq(np.column_stack([x, x**2]) / sd[:, None], y / sd)[0]

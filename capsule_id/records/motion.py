@@ -10,7 +10,6 @@ from scipy.spatial import KDTree
 from scipy.special import logsumexp, softmax
 from scipy.stats import norm
 
-from capsule_id.errors import InputError
 from capsule_id.parameters import STANDING, STEP_SD
 from capsule_id.records.periods import (
     DECIDED,
@@ -31,7 +30,7 @@ from capsule_id.records.tones import (
     stated_gap,
     stated_Omega,
 )
-from capsule_id.rig.filters import Record, sampling_step
+from capsule_id.rig.filters import Record, uneven_sampling
 from capsule_id.rig.model import Table
 
 # mean velocity: Estimates the mean velocity of the capsule, its standard error and the direction of motion with its
@@ -442,9 +441,7 @@ def measured_motion(table: Table) -> MeasuredMotion:
     time, columns = table["time"], table.columns
     drive = recorded_drive(table)
     Omega = drive.Omega if drive else stated_Omega(table)
-    try:
-        sampling_step(time)
-    except InputError as error:
+    if (error := uneven_sampling(time)) is not None:
         reason = f"{error.rule} ({error.value})"
         return MeasuredMotion(
             UNDECIDED, float("nan"), Evidence(drive, Omega, None, None, None, (reason,)), float("nan")

@@ -445,7 +445,7 @@ def _whole(
         omega, zeta = omega * float(np.exp(step[0])), float(np.clip(zeta + step[1], 1e-6, OSCILLATES))
     left = (values - projection.Q @ (projection.Q.T @ values)) / record.noise
     squares, few = np.cumsum(left**2), slice(len(left) // 2)
-    if squares[-1] > len(left) + 4.0 * np.sqrt(2.0 * len(left)) or np.max(np.abs(step)) > 0.01:
+    if squares[-1] > len(left) + SIGNIFICANT * np.sqrt(2.0 * len(left)) or np.max(np.abs(step)) > 0.01:
         return None
     q = projection.Q[few]
     own, shared = np.cumsum(q * left[few, None], axis=0), np.cumsum(q[:, :, None] * q[:, None, :], axis=0)

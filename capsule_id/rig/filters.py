@@ -103,6 +103,24 @@ def largest_offset(time: Record, step: float) -> float:
     return float(np.max(np.abs(time - time[0] - step * np.arange(len(time)))))
 
 
+def uneven_sampling(time: Record) -> InputError | None:
+    """What a filter needs and times (n,), s, increasing, lack; None for an evenly spaced record.
+
+    No sample of one lies further than ``TIMING_TOLERANCE`` of a step from the even grid between the first and the last.
+    """
+    if len(time) < 2:
+        return InputError("a filter needs at least 2 samples", f"{len(time)}", "give a longer record")
+    step = float(time[-1] - time[0]) / (len(time) - 1)
+    if largest_offset(time, step) <= TIMING_TOLERANCE * step:
+        return None
+    steps = np.diff(time)
+    return InputError(
+        "a filter needs evenly spaced samples",
+        f"steps from {steps.min():g} to {steps.max():g} s",
+        "resample the record evenly, or export it raw",
+    )
+
+
 def sampling_step(time: Record) -> float:
     """The sampling step of an evenly spaced record, s.
 
@@ -113,20 +131,11 @@ def sampling_step(time: Record) -> float:
     Raises
     ------
     InputError
-        If a sample lies further than ``TIMING_TOLERANCE`` of a step from the even grid between the first and the last.
+        If ``uneven_sampling`` finds a fault.
     """
-    if len(time) < 2:
-        raise InputError("a filter needs at least 2 samples", f"{len(time)}", "give a longer record")
-    step = float(time[-1] - time[0]) / (len(time) - 1)
-    offset = largest_offset(time, step)
-    if not offset <= TIMING_TOLERANCE * step:
-        steps = np.diff(time)
-        raise InputError(
-            "a filter needs evenly spaced samples",
-            f"steps from {steps.min():g} to {steps.max():g} s",
-            "resample the record evenly, or export it raw",
-        )
-    return step
+    if (fault := uneven_sampling(time)) is not None:
+        raise fault
+    return float(time[-1] - time[0]) / (len(time) - 1)
 
 
 def window_samples(window: float, step: float) -> int:

@@ -15,7 +15,7 @@ from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, OF_DERIVATIVE, SIGN_ERRORS, derivative_ratio, drive_power, phasor
 from capsule_id.records.tones import FEWEST_IN_PERIOD, recorded_drive, stated_Omega
 from capsule_id.records.view import describe_run
-from capsule_id.rig.filters import median_step, sampling_step
+from capsule_id.rig.filters import median_step, uneven_sampling
 from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings, NameRule, QuantityRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE
@@ -66,12 +66,9 @@ def _frequencies(settings: Any, columns: Mapping[str, Column]) -> str:
 
 def _uneven_base(settings: Any, columns: Mapping[str, Column]) -> str:
     """What is uneven in the times of a base without a stated frequency."""
-    if settings.Omega is None and settings.f is None:
-        try:
-            sampling_step(columns["time"].values)
-        except InputError as error:
-            return error.value
-    return ""
+    unstated = settings.Omega is None and settings.f is None
+    fault = uneven_sampling(columns["time"].values) if unstated else None
+    return "" if fault is None else fault.value
 
 
 def present(*names: str) -> Callable[[Any, Mapping[str, Column]], str]:

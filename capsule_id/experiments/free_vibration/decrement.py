@@ -34,6 +34,8 @@ LIGHT_RATIOS, STRONG_RATIOS = (0.001, 0.01, 0.03, 0.1), (0.2, 0.4, 0.7, 1.0, 1.5
 SMALLEST_RATIO, LARGEST_SEARCHED, LARGEST_RATIO = 1e-6, 30.0, 0.9
 #: Unknowns of a viscous decay: k1, c, two initial conditions, offset.
 UNKNOWNS = 5
+#: Turning points, or crossings of the rest position, that a whole period has, both ends included.
+WHOLE_PERIOD = 3
 #: Samples that are searched: at least, at most on the grid, there first for a rough fit, and at most in the refinement.
 FEWEST_SEARCHED, MOST_SEARCHED, MOST_ROUGH, MOST_REFINED = 16, 1000, 100, 20_000
 #: Spectra with fewer periods are checked by a fit; its damping ratio beyond which a spectrum may have no peak.
@@ -107,7 +109,7 @@ class Decrement:
     @property
     def first_ratio(self) -> float:
         """Ratio of the first two amplitudes, at least 1; the mean of neighbouring peaks cancels the error of the rest."""
-        if len(self.peaks) < 3:
+        if len(self.peaks) < WHOLE_PERIOD:
             return float(np.exp(0.5 * max(self.delta, 0.0)))
         first, second, third = np.abs(self.peaks[:3])
         return max(1.0, float((first + second) / (second + third)))
@@ -122,7 +124,7 @@ def equilibrium(values: np.ndarray) -> float:
     while True:
         tail = values[-length:]
         crossings = np.flatnonzero(np.diff(np.signbit(tail - np.mean(tail))))
-        if len(crossings) >= 3:
+        if len(crossings) >= WHOLE_PERIOD:
             last = len(crossings) - 1 - (len(crossings) - 1) % 2
             return float(np.mean(tail[crossings[0] + 1 : crossings[last] + 1]))
         if length >= len(values) or np.ptp(tail) < SWINGING_RATIO * np.ptp(values):
@@ -171,14 +173,14 @@ def logarithmic_decrement(
     smoothed : (n,) the record after Savitzky–Golay, which locates the half cycles (default: ``values``)
     jumps : whether the readings may jump where the rod turns, as an acceleration does
     """
-    if len(values) < 5:
+    if len(values) < UNKNOWNS:
         return None
     rest = equilibrium(values)
     guide = (values if smoothed is None else smoothed) - rest
     smallest = PEAK_RANGE_RATIO_OF_JUMPS if jumps else PEAK_RANGE_RATIO
     lowest = max(SIGNIFICANT * noise_level(values), smallest * float(np.ptp(guide)))
     times, peaks = half_cycle_extremes(time, guide, values - rest, lowest)
-    if len(times) < 3:
+    if len(times) < WHOLE_PERIOD:
         return None
     return Decrement.of(np.arange(len(times)), times, peaks, m1)
 

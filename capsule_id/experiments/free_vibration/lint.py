@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
@@ -37,7 +36,7 @@ from capsule_id.parameters import parameter
 from capsule_id.records.faults import aliases, sampling
 from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
 from capsule_id.records.tones import length_of_motion, other_tone
-from capsule_id.rig.filters import loudest_part, median_step, sampling_step
+from capsule_id.rig.filters import loudest_part, median_step, uneven_sampling
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.rig.units import factor_to_si
@@ -245,11 +244,8 @@ def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterab
     settings, thin, cut = table.settings, default_block_size(time, values), first_periods(table).settings.stop
     frequency, (rate, even) = decay_frequency(time, values), sampling(time)
     periods, per_period = (time[-1] - time[0]) * frequency, rate / frequency
-    uneven = dict[str, Any]()
-    try:
-        sampling_step(time)
-    except InputError as error:
-        uneven = {"rule": error.rule, "value": error.value}
+    fault = uneven_sampling(time)
+    uneven = {} if fault is None else {"rule": fault.rule, "value": fault.value}
     means: Facts = {
         "file": table.file,
         "samples": len(time),

@@ -11,7 +11,7 @@ from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, OF_DERIVATIVE, SIGN_ERRORS, derivative_ratio, phasor
 from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
-from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
+from capsule_id.rig.filters import PIECE, loudest_part, median_step, uneven_sampling
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, PlainRule, QuantityRule, WordsRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE, Node, is_count, shown
@@ -181,11 +181,7 @@ def _means(time: np.ndarray, values: np.ndarray, number: np.ndarray, by_sample: 
 
 def is_even(time: np.ndarray) -> bool:
     """Whether the record is evenly sampled, as filters require."""
-    try:
-        sampling_step(time)
-    except InputError:
-        return False
-    return True
+    return uneven_sampling(time) is None
 
 
 def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READINGS_PER_PERIOD) -> int:

@@ -449,6 +449,8 @@ def overview(view: MotionView, figure: Figure | SubFigure) -> None:
 
 
 _BINS = 40
+# Largest number of parameters whose panels are large; the tick labels of small ones stand upright.
+_ROOMY = 4
 # Levels of the share of the draws at lower density: the contours hold 95 % and 68 %.
 _LEVELS = (0.05, 0.32, 1.0)
 # A panel shows the central 99.8 %: one stray walker must not shrink everything else to a dot.
@@ -458,9 +460,9 @@ _TAILS = (0.1, 99.9)
 def corner_size(columns: SampledParameters) -> tuple[float, float]:
     """Width and height of ``corner``, inches."""
     n = len(columns.names)
-    panels = n * (2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n)))
+    panels = n * (2.6 if n <= 2 else 1.9 if n <= _ROOMY else min(1.25, max(0.9, 15 / n)))
     # The key stands in the empty upper triangle, or above the panels where that is too small.
-    return 1.6 + panels, 1.25 + panels + (0.9 if n <= 2 else 0.0) + (0.25 if n > 4 else 0.0)
+    return 1.6 + panels, 1.25 + panels + (0.9 if n <= 2 else 0.0) + (0.25 if n > _ROOMY else 0.0)
 
 
 def corner(columns: SampledParameters, figure: Figure | SubFigure) -> None:
@@ -469,7 +471,7 @@ def corner(columns: SampledParameters, figure: Figure | SubFigure) -> None:
     The point fit is marked in black, the paper's estimate, where it lies in the picture, in vermilion.
     """
     n, flat = len(columns.names), columns.draws.reshape(-1, len(columns.names))
-    set_margins(figure, left=1.25, right=0.35, bottom=1.25 if n > 4 else 1.0, top=1.15 if n <= 2 else 0.25)
+    set_margins(figure, left=1.25, right=0.35, bottom=1.25 if n > _ROOMY else 1.0, top=1.15 if n <= 2 else 0.25)
     grid, ends = figure.add_gridspec(n, n, wspace=0.06, hspace=0.06), _ends(columns)
     for i, j in ((row, column) for row in range(n) for column in range(row + 1)):
         ax = figure.add_subplot(grid[i, j], xticks=[], yticks=[])
@@ -498,7 +500,7 @@ def corner(columns: SampledParameters, figure: Figure | SubFigure) -> None:
                     parse_math=False,
                 )
         ax.tick_params(labelsize=SMALL - 0.5, length=3)
-        ax.tick_params("x", labelrotation=40 if n <= 4 else 90)
+        ax.tick_params("x", labelrotation=40 if n <= _ROOMY else 90)
         ax.ticklabel_format(useOffset=False, style="plain")
     figure.align_labels()
     key = (
