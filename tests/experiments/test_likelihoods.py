@@ -261,9 +261,9 @@ class TestLeftOut:
         narrow = replace(misfit, design=misfit.design / 100.0)
         covariance = np.diag(narrow.sd**2) + narrow.design @ narrow.design.T
         joint = stats.multivariate_normal(cov=covariance).logpdf(narrow.raw)
-        found = narrow.left_out(experiment.blocks)
+        found = narrow.left_out(experiment.blocks(experiment.n))
         assert len(found) == BLOCKS
-        edges = [*experiment.blocks, experiment.n]
+        edges = [*experiment.blocks(experiment.n), experiment.n]
         for k in (0, 1, 30, BLOCKS - 1):
             rest = np.delete(np.arange(experiment.n), np.arange(edges[k], edges[k + 1]))
             given = stats.multivariate_normal(cov=covariance[np.ix_(rest, rest)]).logpdf(narrow.raw[rest])
@@ -283,10 +283,10 @@ class TestLeftOut:
     def test_a_long_table_has_stretches_of_rows(self, monkeypatch: pytest.MonkeyPatch) -> None:
         experiment = record(UNIFORM)
         monkeypatch.setattr(type(experiment), "time_series", False)
-        assert len(experiment.blocks) == min(experiment.n, MOST_TERMS)
+        assert len(experiment.blocks(experiment.n)) == min(experiment.n, MOST_TERMS)
         monkeypatch.setattr(base, "MOST_TERMS", 7)
-        assert len(experiment.blocks) == 7
-        assert np.max(np.diff(experiment.blocks)) <= -(-experiment.n // 7)
+        assert len(experiment.blocks(experiment.n)) == 7
+        assert np.max(np.diff(experiment.blocks(experiment.n))) <= -(-experiment.n // 7)
 
     def test_replicates_scatter_by_the_noise(self) -> None:
         experiment = record(UNIFORM)
