@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +22,7 @@ from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.curvature import require_width
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import HEAVY, LogPosterior, Scale, half_ensemble
-from capsule_id.physics.batches import in_batches, pool
+from capsule_id.physics.batches import in_batches
 from capsule_id.precision import COMPILE
 
 # quadrature: Quadrature nodes of the integrals over scatters.
@@ -503,8 +504,9 @@ def left_out(target: LogPosterior, theta: Float[np.ndarray, "w d"]) -> list[np.n
 
     def of_motions(e: Experiment) -> np.ndarray:
         stop_if_interrupted()
-        # A motion takes milliseconds, and minutes to compile once more.
-        return np.stack(list(pool().map(lambda own: e.left_out(e.local(own)), values)))
+        # A motion takes milliseconds, and minutes to compile once more. Its lanes may wait for the threads of ``pool``.
+        with ThreadPoolExecutor() as threads:
+            return np.stack(list(threads.map(lambda own: e.left_out(e.local(own)), values)))
 
     return [of_motions(e) if e.event_driven else next(rows) for e in target.experiments]
 
