@@ -396,6 +396,11 @@ def rows_of(target: LogPosterior) -> int:
     return half if target.work < HEAVY else -(-half // ROWS_TOGETHER) * ROWS_TOGETHER
 
 
+def rows_together(target: LogPosterior) -> int:
+    """Rows of a batch within a program: fewer, the more work each takes."""
+    return max(min(ROWS_TOGETHER, ROWS_TOGETHER * HEAVY // target.work), 1)
+
+
 def density_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:
     """Return the log-posterior of ``target``, scatters not integrated out: u (w, d) -> (w,), -inf where not finite."""
     terms = terms_of(target)
@@ -448,9 +453,9 @@ def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: 
     of_row = partial(_conditional, layout, target, bend)
     if target.work < HEAVY:
         return jax.vmap(of_row)(v, start, step)
-    together = max(ROWS_TOGETHER * HEAVY // target.work, 1)
     # JAX joins no batches of outputs without elements, which a target without scatters has.
-    return jax.lax.map(lambda row: of_row(*row), (v, start, step), batch_size=together if layout.scatter else None)
+    together = rows_together(target) if layout.scatter else None
+    return jax.lax.map(lambda row: of_row(*row), (v, start, step), batch_size=together)
 
 
 def _conditional(
@@ -524,7 +529,7 @@ def _left_out(target: LogPosterior, theta: Any) -> Any:
                 found |= zip(group.members, terms, strict=True)
         return jnp.concatenate([found[i] for i in sorted(found)])
 
-    return jax.lax.map(of_row, theta, batch_size=ROWS_TOGETHER)
+    return jax.lax.map(of_row, theta, batch_size=rows_together(target))
 
 
 def _sum_by(values: Any, label: Sequence[int], number: int) -> Any:
