@@ -739,7 +739,8 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     said, missing = f"the file says {found.names[index]!r}", "the file states no unit"
     if (text and unit is None) or named < 0 or (constant and rule.varies):
         return None
-    if (below := unit_of(found.units[index], [rule.si])) not in (None, unit):
+    below = unit_of(found.units[index], [rule.si])
+    if unit and below and factor_to_si(unit, rule.si) != factor_to_si(below, rule.si):  # um is µm
         unit, missing = None, f"the header says {unit}, the row of units {below}"
     by_name = named + MEANT_SCORE * meant if named or name == "force" else 0.0
     if by_name <= 0.0 or meant < 0:

@@ -152,7 +152,7 @@ def tdms(columns: Columns, waveform: bool = True, parts: int = 2) -> bytes:
         ]
         meta = struct.pack("<I", len(names) + 1) + string("/'run'") + struct.pack("<II", 0xFFFFFFFF, 0)
         for k, (name, (kind, values)) in enumerate(zip(names, stored, strict=True)):
-            properties = [word("unit_string", "mm")]
+            properties = [word("unit_string", name.partition(" [")[2].removesuffix("]") or "mm")]
             if waveform:
                 properties += [double("wf_start_offset", time[0]), double("wf_increment", time[1] - time[0])]
             if k == 0:
