@@ -252,8 +252,6 @@ FEWEST_PARTS, MOST_PARTS = 4, 8
 ROWS_PER_UNKNOWN = 2
 #: Largest sd of a part that determines a parameter, relative to its value.
 LARGEST_RELATIVE_SD = 0.5
-#: Largest ratio of the values of a part and of all readings. A part of noise alone is fitted by a motion of its own.
-LARGEST_RATIO = 100.0
 #: Smallest factor of an sd that counts.
 SMALLEST_FACTOR = 1.01
 
@@ -352,11 +350,10 @@ def estimates_of_parts(
     scale = float(np.average([one.scale for _, one in parts], weights=freedom))
     for part, one in parts:
         found = one.scaled(scale)
-        pairs = [(row, *found[row.symbol]) for row in part.parameters if row.symbol in found]
-        known = [(row, value, sd) for row, value, sd in pairs if 0.0 < sd < LARGEST_RELATIVE_SD * abs(value)]
-        ratios = [value / values[row.name] for row, value, _ in known if row.positive]
-        if all(1.0 / LARGEST_RATIO < ratio < LARGEST_RATIO for ratio in ratios):
-            yield from ((row.name, (value, sd)) for row, value, sd in known)
+        for row in part.parameters:
+            value, sd = found.get(row.symbol, (np.nan, np.nan))
+            if 0.0 < sd < LARGEST_RELATIVE_SD * abs(value):
+                yield row.name, (value, sd)
 
 
 def rows_of_parts(e: Experiment, values: Mapping[str, float], number: int, by_load: bool) -> list[np.ndarray]:
