@@ -205,6 +205,22 @@ def test_marks_of_plain_tables_are_asked_about(tmp_path: Path) -> None:
     np.testing.assert_allclose(table_["current"], [0.5, 1.0, 1.5, 2.0, 2.5])
 
 
+def test_a_plain_table_has_one_decimal_mark(tmp_path: Path) -> None:
+    """A point beside commas of another column is a damaged cell, or parts thousands, which is asked about."""
+    head, entry = "speed [m/s];distance [mm]\n0,1;12\n", '[[experiment]]\nkind = "dynamic_friction"\nfile = "t.csv"\n'
+    for cell, rule in (("1.5", "a cell must be a number, '1.5'"), ("1.500", "whether a mark parts thousands")):
+        with pytest.raises(capsule_id.InputError, match=rf"t\.csv:3:5: {rule}"):
+            read(tmp_path, f"{head}0,2;{cell}\n", entry)
+    (table,) = read(tmp_path, f"{head}0,2;1,5\n", entry).tables
+    np.testing.assert_allclose(table["distance"], [0.012, 0.0015])
+
+
+def test_rows_of_separators_alone_are_counted(tmp_path: Path) -> None:
+    entry = '[[experiment]]\nkind = "dynamic_friction"\nfile = "t.csv"\n'
+    (table,) = read(tmp_path, "speed [m/s],distance [mm]\n0.1,1\n,\n0.2,4\n,\n", entry).tables
+    assert (len(table["speed"]), table.lost.tolist()) == (2, [3, 5])
+
+
 def test_thousands_without_decimals_are_read(tmp_path: Path) -> None:
     """Before: IndexError, where all that shows the decimal mark is how the thousands are parted."""
     entry = '[[experiment]]\nkind = "motor_current"\nfile = "t.csv"\n'

@@ -10,14 +10,15 @@ from tests.rig.folder import TABLES, write_folder
 RECORD = TABLES["free_vibration_1.csv"]
 # (table, its content with the mark, part of the rule)
 TABLE_FAULTS = [
-    ("static_friction.csv", MARK, "the first line must be headers"),
-    ("static_friction.csv", MARK + "\n  \n", "the first line must be headers"),
+    ("static_friction.csv", MARK, "a table must not be empty"),
+    ("static_friction.csv", MARK + "\n  \n", "a table must not be empty"),
     ("static_friction.csv", "‸angle [deg]\n", "a table must have rows, a header only"),
     ("static_friction.csv", "‸33\n34\n", "the first line must be headers"),
     ("static_friction.csv", "‸angle\n34\n", "the first line must be headers `name [unit]`, 'angle'"),
     ("static_friction.csv", "‸angle []\n34\n", "the first line must be headers"),
     ("static_friction.csv", "‸# tilts\nangle [deg]\n34\n", "the first line must be headers"),
-    ("static_friction.csv", "‸\nangle [deg]\n34\n", "the first line must be headers"),
+    ("static_friction.csv", "‸\nangle [deg]\n34\n", "must not be blank"),
+    ("static_friction.csv", "angle [deg]\n34\n‸\n35\n", "must not be blank"),
     ("static_friction.csv", "angle [deg]\n34\n‸# moved\n35\n", "a row must be numbers"),
     ("static_friction.csv", "‸angle [mm]\n34\n", "angle: unit must have the dimension of rad"),
     ("static_friction.csv", "‸angle [degrees]\n34\n", "angle: unknown unit symbol degrees"),
@@ -41,6 +42,7 @@ TABLE_FAULTS = [
         "a row must have 2 cells, as the header has, 4 cells",
     ),
     ("dynamic_friction.csv", "speed [m/s],distance [mm]\n0.1,‸\n", "a cell must not be empty"),
+    ("dynamic_friction.csv", "speed [m/s];distance [mm]\n0,1;12\n0,2;‸1.5\n", "a cell must be a number"),
     ("dynamic_friction.csv", "speed [m/s];distance [mm]\n0,1;1,2\n0,2;‸1.5\n", "a cell must be a number"),
     (
         "dynamic_friction.csv",

@@ -32,6 +32,7 @@ from capsule_id.rig.formats.text import (
     apart_marks,
     bare,
     cells_of,
+    decimal_mark,
     is_comment,
     is_row,
     is_stamp,
@@ -264,6 +265,8 @@ def _is_reading(cell: str, layout: Layout) -> bool:
 # csv: Reads CSV tables: a header ``name [unit]`` per column, then rows of numbers as any text export has them.
 
 
+_BLANK = ("lines between the first and the last must not be blank", "a blank line", "remove the line")
+_ONE_MARK = "correct the cell: a table has one decimal mark"
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 
 
@@ -281,6 +284,13 @@ def read_csv(content: bytes, path: Path) -> RawTable:
         Naming line and column of the first fault.
     """
     file = TextFile(content, path)
+    if not file.line(0).strip():
+        empty = (
+            "a table must not be empty",
+            "no text at all",
+            "head each column `name [unit]` and write a row per reading",
+        )
+        raise InputError(*(_BLANK if any(line.strip() for line in file.lines()) else empty), path, 1, 1)
     mark, units = units_of_header(file)
     blocks = ((number, block) for number, block in file.blocks(1) if re.search(rb'["#%]', block))
     for line, row in ((number + k, row) for number, block in blocks for k, row in enumerate(lines_of(block), 1)):
@@ -297,15 +307,51 @@ def read_csv(content: bytes, path: Path) -> RawTable:
         raise InputError(rule, found, "correct the row, or the header", path, line, place)
     layout = Layout(line, missing=NO_READING, decimal="." if mark == "," and width > 1 else None)
     export = read_text(content, path, layout)
-    empty = [np.full(len(export.lines), np.nan)] * (width - export.width)  # every last cell is
-    columns = (*map(export.values, range(export.width)), *empty)
+    _refuse_two_marks(file, mark)
+    bare_rows = _lines_without_cells(file, export.lines)
+    last = [np.full(len(export.lines), np.nan)] * (width - export.width)  # every last cell is empty
+    columns = (*map(export.values, range(export.width)), *last)
     raw = RawTable(tuple(units), tuple(units.values()), columns, export.lines, export.place, export.encoding)
     missing = np.any(np.isnan(columns), axis=0)
     if missing.all():  # the first cell of the first row that holds none
         here = raw.place(0, int(np.argmax([np.isnan(column[0]) for column in columns])))
         remedy = "write a number; a table must have a row without missing cells"
         raise InputError("a cell must not be empty", "nothing", remedy, *here)
-    return replace(raw.taken(np.flatnonzero(~missing)), lost=export.lines[missing])
+    lost = np.sort(np.append(export.lines[missing], bare_rows).astype(int))
+    return replace(raw.taken(np.flatnonzero(~missing)), lost=lost)
+
+
+def _refuse_two_marks(file: TextFile, delimiter: str) -> None:
+    """Refuse a table with decimal points in one column and decimal commas in another: a mark stands in a damaged cell."""
+    if delimiter == "," or not all(any(mark in block for _, block in file.blocks(1)) for mark in (b",", b".")):
+        return
+    rows = [(number, row) for number, row in enumerate(file.lines(1), 2) if is_row(row)]
+    columns = [*zip(*(texts_of(row, delimiter) for _, row in rows), strict=True)]
+    apart = apart_marks(columns, NO_READING, None)
+    # A column that leaves open what its mark parts is asked about when it is read.
+    texts = {k: [text.replace(apart.get(k) or " ", "") for text in column] for k, column in enumerate(columns)}
+    marks = {k: decimal_mark(column, NO_READING) for k, column in texts.items() if apart.get(k, "") is not None}
+    marks = {k: mark for k, mark in marks.items() if mark}
+    for k, mark in marks.items():
+        if mark != next(iter(marks.values())):
+            number, row = next(
+                (number, row) for text, (number, row) in zip(texts[k], rows, strict=True) if mark in text
+            )
+            place = place_of_cell(row, delimiter, k)
+            raise InputError(
+                "a cell must be a number", shown(texts_of(row, delimiter)[k]), _ONE_MARK, file.path, number, place
+            )
+
+
+def _lines_without_cells(file: TextFile, rows: np.ndarray) -> list[int]:
+    """1-based lines, besides the ``rows`` of a table, that hold separators alone; a blank line between rows is refused."""
+    if len(rows) == sum(text.count(b"\n") for _, text in file.blocks(1)):
+        return []
+    known = {*rows.tolist()}
+    others = [(number, text.strip()) for number, text in enumerate(file.lines(1), 2) if number not in known]
+    for number in (number for number, text in others if not text and number < rows[-1]):
+        raise InputError(*_BLANK, file.path, number, 1)
+    return [number for number, text in others if text]
 
 
 def units_of_header(file: TextFile) -> tuple[str, dict[str, str]]:
