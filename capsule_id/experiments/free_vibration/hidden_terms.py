@@ -122,11 +122,9 @@ def zero_jumps(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | N
     end = MOST_HALF_SWINGS * half
     if e.order > 0 or np.count_nonzero(time <= end) < FEWEST_OF_ALL:
         return None
-    begin = float(decay_window(e.table)[0][0])
-    settings = replace(e.table.settings, start=begin, stop=begin + float(min(end, time[-1])))
     thin = block_size(time[time <= end], values[time <= end], 2.0 * MOST_READINGS)
     model = replace(e.model, thin=thin, noise="white", drift="none")
-    part = e.with_model(model, table=replace(e.table, settings=settings))
+    part = e.between(0.0, float(min(end, time[-1])), model)
     left, design, moved = sensitivities(part, theta)
     curve = part.values - left
     rate = np.gradient(curve, part.time)

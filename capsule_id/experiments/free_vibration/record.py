@@ -491,6 +491,12 @@ class DecayRecord(Decay):
         time, values = decay_window(self.table)
         return time - time[0], values
 
+    def between(self, first: float, last: float, model: DecayModel | None = None) -> Self:
+        """The readings between two times since the first one, s, with a model (default: that of all readings)."""
+        begin = float(decay_window(self.table)[0][0])
+        settings = replace(self.table.settings, start=begin + first, stop=begin + last)
+        return self.with_model(model or self.model, table=replace(self.table, settings=settings))
+
     @property
     def condensed(self) -> tuple[np.ndarray, np.ndarray]:
         """As ``whole``; of a long record block means, for the paper's estimate. Their times start at the first mean.
