@@ -296,7 +296,6 @@ def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> dict[str, tuple
 
 check_halves = halves(changes_of_second_half)
 check_positions = each("decays.position", position)
-check_size_of_residuals = each("decays.residuals", size_of_residuals)
 check_drift = each("decays.drift", drift, joined=False)
 check_zero = each("decays.zero", zero_jumps)
 
@@ -345,7 +344,7 @@ class FreeVibration(DecayRecord):
         check_halves,
         check_aliases,
         check_positions,
-        check_size_of_residuals,
+        each("decays.residuals", size_of_residuals),
         check_found_forces,
         check_drift,
         check_zero,
@@ -364,7 +363,11 @@ class FreeVibration(DecayRecord):
     def noise_facts(self) -> Facts:
         return {
             "model": "decay",
-            "present": self.model.additions,
+            "present": [
+                *(EFFECTS[symbol] for symbol in self.model.symbols),
+                *["drift of the zero"] * (self.model.drift != "none"),
+                *["hum"] * bool(self.model.hum),
+            ],
             "second": self.replaced,
             "tone": None if self.model.hum else other_tone(self.time, self.values),
             "stated": self.stated_words,

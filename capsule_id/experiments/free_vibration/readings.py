@@ -346,15 +346,6 @@ class DecayModel:
         return (*noise, *(("drift_ratio", "drift_time") if self.drift == "gp" else ()))
 
     @property
-    def additions(self) -> list[str]:
-        """Effects of the model that the default lacks, in words."""
-        return [
-            *(EFFECTS[symbol] for symbol in self.symbols),
-            *["drift of the zero"] * (self.drift != "none"),
-            *["hum"] * bool(self.hum),
-        ]
-
-    @property
     def name(self) -> str:
         """Words for tables and legends."""
         words = (
@@ -382,17 +373,12 @@ def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
     return table["time"][inside], table[channel_of(table)][inside]
 
 
-def stated_model(table: Table) -> DecayModel:
-    """Return the model that the settings of ``table`` state; a long record is thinned where they leave that open."""
-    thin = table.settings.thin or default_block_size(*decay_window(table))
-    return replace(DecayModel.stated(table.settings), thin=thin)
-
-
 def first_periods(table: Table[DecaySettings]) -> Table[DecaySettings]:
     """Return the table with a stop after ``MOST_PERIODS``, where none is stated and the record is longer."""
     time, values = decay_window(table)
-    last = MOST_PERIODS * block_size(time, values, 1.0)
-    if table.settings.stop is not None or last >= len(time) or block_size(time, values, 1.0) == 1:
+    period = block_size(time, values, 1.0)
+    last = MOST_PERIODS * period
+    if table.settings.stop is not None or last >= len(time) or period == 1:
         return table
     return replace(table, settings=replace(table.settings, stop=float(time[last])))
 

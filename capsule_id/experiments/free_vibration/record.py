@@ -61,10 +61,10 @@ from capsule_id.experiments.free_vibration.readings import (
     block_means,
     channel_of,
     decay_window,
+    default_block_size,
     further_parameters,
     hum_columns,
     is_even,
-    stated_model,
 )
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
@@ -350,9 +350,12 @@ class DecayRecord(Decay):
     ) -> None:
         """Make one record; ``model`` None: as stated in the settings; ``screened`` gives starts."""
         self.friction = friction
-        self.model = model or stated_model(table)
         self.order = CHANNELS[channel_of(table)].order
         time, values = decay_window(table)
+        if model is None:  # a long record is thinned where its settings leave that open
+            stated = DecayModel.stated(table.settings)
+            model = replace(stated, thin=table.settings.thin or default_block_size(time, values))
+        self.model = model
         blocks = block_means(time - float(time[0]), values, self.model.thin, by_sample=self.order > 0)
         self.time, self.values, self.nodes, self.weights = blocks.time, blocks.values, blocks.nodes, blocks.weights
         self.times = ReadingTimes.of(blocks)
