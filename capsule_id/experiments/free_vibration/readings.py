@@ -1,7 +1,7 @@
 """Readings of free decays: channels, block means, settings, and the window that contains the decay."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -10,7 +10,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
-from capsule_id.rig.filters import PIECE, loudest_part, median_step, uneven_sampling
+from capsule_id.rig.filters import loudest_part, median_step, uneven_sampling
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, PlainRule, QuantityRule, WordsRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE, Node, is_count, shown
@@ -97,20 +97,12 @@ def block_means(time: np.ndarray, values: np.ndarray, size: int, by_sample: bool
     if size == 1:
         one = np.ones((len(time), 1))
         return Blocks(time, values, time, time, one[:, 0], time[:, None], one)
-    if not is_even(time):
+    if is_even(time):
+        time, values = (part[: len(part) // size * size] for part in (time, values))
+        number = np.arange(len(time)) // size
+    else:
         width = size * median_step(time)
         number = np.unique(((time - time[0]) // width).astype(int), return_inverse=True)[1]
-        return _means(time, values, number, by_sample)
-    samples, step = len(time) // size * size, max(PIECE // size, 1) * size
-    parts = []
-    for first in range(0, samples, step):
-        part = slice(first, min(first + step, samples))
-        parts.append(_means(time[part], values[part], np.arange(part.stop - first) // size, by_sample))
-    return Blocks(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Blocks)))
-
-
-def _means(time: np.ndarray, values: np.ndarray, number: np.ndarray, by_sample: bool) -> Blocks:
-    """Means of the readings with each ``number`` (n,), which counts blocks from 0."""
     count = np.bincount(number).astype(float)
 
     def mean(x: np.ndarray) -> np.ndarray:
