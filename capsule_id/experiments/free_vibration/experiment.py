@@ -19,7 +19,7 @@ from capsule_id.experiments.free_vibration.hidden_terms import (
 )
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
-from capsule_id.experiments.free_vibration.screening import Screening, decay_starts, nested_starts
+from capsule_id.experiments.free_vibration.screening import Screening
 from capsule_id.experiments.free_vibration.second_fit import SHORTEST, second_models
 from capsule_id.experiments.statistics import further_columns, weighted_mean
 from capsule_id.parameters import parameter
@@ -356,9 +356,6 @@ class FreeVibration(DecayRecord):
     @classmethod
     def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
         return second_models(records, readings)
-
-    starts = decay_starts
-    nested_starts = nested_starts
 
     def noise_facts(self) -> Facts:
         return {

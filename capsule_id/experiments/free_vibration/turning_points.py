@@ -31,8 +31,7 @@ from capsule_id.experiments.free_vibration.hidden_terms import (
 )
 from capsule_id.experiments.free_vibration.models import half_cycles
 from capsule_id.experiments.free_vibration.readings import DecayModel, decay_window, further_parameters
-from capsule_id.experiments.free_vibration.record import Decay, DecayAbout, Screened
-from capsule_id.experiments.free_vibration.screening import force_starts
+from capsule_id.experiments.free_vibration.record import Decay, DecayAbout, Screened, force_starts
 from capsule_id.experiments.free_vibration.second_fit import Demanded, replaced
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
