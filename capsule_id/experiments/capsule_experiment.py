@@ -17,7 +17,6 @@ from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.record import DecayRecord
-from capsule_id.experiments.free_vibration.screening import decay_starts
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
     FrictionModel,
@@ -181,7 +180,7 @@ class CapsuleDecay(CapsuleForward, DecayRecord):
     def starts(self) -> dict[str, Start]:
         size, rate = abs(float(self.rough.peaks[0])), np.polyfit(self.time[:5], self.values[:5], 1)[0]
         return {
-            **decay_starts(self),
+            **DecayRecord.starts(self),
             f"x_start[{self.label}]": Start(float(self.values[0] - equilibrium(self.values)), 0.02 * size),
             f"y_start[{self.label}]": Start(float(rate), 0.05 * self.rough.Omega_o * size),
             **stated_starts(self.label, G=self.table.settings.gap),

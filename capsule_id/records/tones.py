@@ -177,10 +177,22 @@ def fit_harmonic(time: Record, values: Record, Omega: float) -> Harmonic:
         near = abs(strongest - Omega) < _search_half_width(time)
         guesses = [strongest] if near else [Omega, strongest]
     ends = [_refine(time, values, guess) for guess in guesses]
-    (found, left), (other, less) = ends[0], ends[-1]
+    freedom = len(time) - 4
+    # Reduction of the sum of squares, relative to the rest, that is as rare as ``SIGNIFICANT``.
+    significant = float(stats.t.isf(stats.norm.sf(SIGNIFICANT), freedom) ** 2 / freedom)
     # In a coarse record the stated frequency and its alias fit equally well: prefer the stated one.
-    better = left - less > _significant_reduction(len(time)) * less
-    return _harmonic_at(time, values, other if better else found, Omega)
+    better = ends[0][1] - ends[-1][1] > significant * ends[-1][1]
+    found, left = ends[-1] if better else ends[0]
+    amplitude, phase, offset = tone_at(time, values, found)
+    angle = found * time + phase
+    slope = -amplitude * np.sin(angle)
+    # The joint standard errors of all four unknowns.
+    jacobian = np.stack([np.cos(angle), slope, slope * time, np.ones_like(time)], axis=1)
+    scale = np.linalg.norm(jacobian, axis=0)
+    noise_sd = float(np.sqrt(left / freedom))
+    refuted = float(np.sum(_residuals(time, values, Omega) ** 2)) - left > significant * left
+    sd = (noise_sd * np.sqrt(_variances(jacobian / scale)) / scale).tolist()
+    return Harmonic(found, sd[2], amplitude, sd[0], phase, sd[1], offset, noise_sd, Omega, refuted)
 
 
 def _spectrum(time: Record, values: Record) -> tuple[np.ndarray, np.ndarray, float]:
@@ -253,12 +265,6 @@ def _residuals(time: Record, values: Record, Omega: float) -> np.ndarray:
     return values - amplitude * np.cos(Omega * time + phase) - offset
 
 
-def _significant_reduction(samples: int) -> float:
-    """Reduction of the sum of squares, relative to the rest, that is as rare as ``SIGNIFICANT``."""
-    freedom = samples - 4
-    return float(stats.t.isf(stats.norm.sf(SIGNIFICANT), freedom) ** 2 / freedom)
-
-
 def _search_half_width(time: Record) -> float:
     """Half-width of the search about a guess, rad/s."""
     return float(2.0 * np.pi * _SEARCH_HALF_WIDTH / (time[-1] - time[0]))
@@ -281,20 +287,6 @@ def _refine(time: Record, values: Record, guess: float) -> tuple[float, float]:
         xtol=TOLERANCE,
     ).x[0]
     return float(found), float(np.sum(_residuals(time, values, found) ** 2))
-
-
-def _harmonic_at(time: Record, values: Record, Omega: float, stated: float) -> Harmonic:
-    """The tone at ``Omega`` with the joint standard errors of all four unknowns."""
-    amplitude, phase, offset = tone_at(time, values, Omega)
-    angle = Omega * time + phase
-    slope = -amplitude * np.sin(angle)
-    jacobian = np.stack([np.cos(angle), slope, slope * time, np.ones_like(time)], axis=1)
-    scale = np.linalg.norm(jacobian, axis=0)
-    left, of_stated = (float(np.sum(_residuals(time, values, one) ** 2)) for one in (Omega, stated))
-    noise_sd = float(np.sqrt(left / (len(time) - 4)))
-    refuted = of_stated - left > _significant_reduction(len(time)) * left
-    sd = (noise_sd * np.sqrt(_variances(jacobian / scale)) / scale).tolist()
-    return Harmonic(Omega, sd[2], amplitude, sd[0], phase, sd[1], offset, noise_sd, stated, refuted)
 
 
 def _variances(jacobian: np.ndarray) -> np.ndarray:

@@ -132,57 +132,40 @@ def equilibrium(values: np.ndarray) -> float:
         length += max(length // 4, 1)
 
 
-def half_cycle_extremes(
-    time: np.ndarray, guide: np.ndarray, values: np.ndarray, lowest: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Time and signed value of the extremum of ``values`` in every half cycle of ``guide``, (p,) each.
-
-    ``guide`` (smoothed, about its equilibrium) only locates the half cycles. They count from the start of the record
-    until the first peak below ``lowest``. The first and the last may be incomplete, so an extremum at an end of the
-    record does not count, nor does one of readings that are all 0.
-    """
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(np.signbit(guide))) + 1, [len(guide)]])
-    times, peaks = [], []
-    for left, right in itertools.pairwise(edges):
-        if np.max(np.abs(guide[left:right])) < lowest:
-            if times:
-                break
-            continue
-        index = left + int(np.argmax(np.abs(values[left:right])))
-        if 0 < index < len(values) - 1 and values[index] != 0.0:
-            times.append(time[index])
-            peaks.append(values[index])
-    return np.array(times), np.array(peaks)
-
-
 def logarithmic_decrement(
-    time: np.ndarray,
-    values: np.ndarray,
-    m1: float,
-    smoothed: np.ndarray | None = None,
-    jumps: bool = False,
+    time: np.ndarray, values: np.ndarray, m1: float, smoothed: np.ndarray, jumps: bool = False
 ) -> Decrement | None:
     """Apply the paper's estimator to ``values``; None where fewer than three half cycles exceed the limits.
 
-    Three turning points with samples on either side take five samples.
+    Half cycles count from the start of the record until the first peak below the limits. The first and the last may be
+    incomplete, so an extremum at an end of the record does not count, nor does one of readings that are all 0. Three turning
+    points with samples on either side take five samples.
 
     Parameters
     ----------
     time, values : (n,) s and m
     m1 : mass of the rod, kg
-    smoothed : (n,) the record after Savitzky–Golay, which locates the half cycles (default: ``values``)
+    smoothed : (n,) the record after Savitzky–Golay, which locates the half cycles
     jumps : whether the readings may jump where the rod turns, as an acceleration does
     """
     if len(values) < UNKNOWNS:
         return None
     rest = equilibrium(values)
-    guide = (values if smoothed is None else smoothed) - rest
+    guide, moved = smoothed - rest, values - rest
     smallest = PEAK_RANGE_RATIO_OF_JUMPS if jumps else PEAK_RANGE_RATIO
     lowest = max(SIGNIFICANT * noise_level(values), smallest * float(np.ptp(guide)))
-    times, peaks = half_cycle_extremes(time, guide, values - rest, lowest)
-    if len(times) < WHOLE_PERIOD:
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(np.signbit(guide))) + 1, [len(guide)]])
+    peaks = list[int]()
+    for left, right in itertools.pairwise(edges):
+        index = left + int(np.argmax(np.abs(moved[left:right])))
+        low = np.max(np.abs(guide[left:right])) < lowest
+        if low and peaks:
+            break
+        if not low and 0 < index < len(values) - 1 and moved[index] != 0.0:
+            peaks.append(index)
+    if len(peaks) < WHOLE_PERIOD:
         return None
-    return Decrement.of(np.arange(len(times)), times, peaks, m1)
+    return Decrement.of(np.arange(len(peaks)), time[peaks], moved[peaks], m1)
 
 
 class ViscousFit(NamedTuple):

@@ -2,14 +2,13 @@
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy import ndimage, stats
 
-from capsule_id.experiments.base import LEVEL, Check, Fitted, Start, ValuesBySymbol, refit
+from capsule_id.experiments.base import LEVEL, Check, Fitted, ValuesBySymbol, refit
 from capsule_id.experiments.free_vibration.decrement import equilibrium, viscous_fit
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
@@ -20,7 +19,7 @@ from capsule_id.experiments.free_vibration.hidden_terms import (
 )
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
 from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
-from capsule_id.experiments.free_vibration.screening import Screening, decay_starts, nested_starts
+from capsule_id.experiments.free_vibration.screening import Screening
 from capsule_id.experiments.free_vibration.second_fit import SHORTEST, second_models
 from capsule_id.experiments.statistics import further_columns, weighted_mean
 from capsule_id.parameters import parameter
@@ -130,10 +129,18 @@ def halves(changes: Changes) -> Check:
 
 def changes_of_second_half(e: DecayRecord, theta: ValuesBySymbol) -> dict[str, tuple[float, float, float, bool]]:
     """See ``Changes``: fits of both halves of a record."""
-    found = [_estimates(half, theta) for half in _halves(e)]
-    if not found:
+    decrement = e.decrement()
+    # The acceleration jumps where the rod turns, so difference quotients give no standard errors.
+    jumps = e.order == 2 and "dry" in e.model.damping
+    if decrement is None or len(decrement.times) < FEWEST_HALF_SWINGS or jumps:
         return {}
-    pairs = {name: (*found[0][name], *found[1][name]) for name in found[0]}
+    # Behind the last peak there is noise alone.
+    time = e.whole[0][e.whole[0] <= decrement.times[-1]]
+    if len(time) < 2 * SHORTEST * e.model.thin:
+        return {}
+    middle, end = float(time[len(time) // 2]), float(time[-1])
+    first, second = (_estimates(e.between(*ends), theta) for ends in ((0.0, middle), (middle, end)))
+    pairs = {name: (*first[name], *second[name]) for name in first}
     return {name: (a, b, float((b - a) / np.hypot(sd_a, sd_b)), True) for name, (a, sd_a, b, sd_b) in pairs.items()}
 
 
@@ -187,10 +194,9 @@ def drift(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
     if e.model.drift != "gp":
         return None
     half = np.pi * np.sqrt(theta["m1"] / theta["k1"])
-    raw, design = e.unwhitened(theta, np)
-    residuals = raw - design @ np.linalg.lstsq(e.whitened(theta, design), e.whitened(theta, raw), rcond=None)[0]
+    residuals = sensitivities(e, theta)[0]
     shape = {symbol: theta[symbol] for symbol in e.model.shapes}
-    slow = np.asarray(drift_by_shape(e.times, np.asarray(residuals), e.model.noise, shape))
+    slow = np.asarray(drift_by_shape(e.times, residuals, e.model.noise, shape))
     curve = e.values - residuals
     fast, motion = fast_rms(e.time, slow, half), fast_rms(e.time, curve, half)
     if fast is None or motion is None:
@@ -279,24 +285,6 @@ def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | Non
     return {"p": p, "low": float(low), "high": float(high), "unit": e.column.unit, **later_start(e)}, p
 
 
-def _halves(e: DecayRecord) -> list[DecayRecord]:
-    """The first and the second half of the part of ``e`` whose peaks exceed its noise; [] for a short one."""
-    decrement = e.decrement()
-    # The acceleration jumps where the rod turns, so difference quotients give no standard errors.
-    jumps = e.order == 2 and "dry" in e.model.damping
-    if decrement is None or len(decrement.times) < FEWEST_HALF_SWINGS or jumps:
-        return []
-    time = e.whole[0][e.whole[0] <= decrement.times[-1]]
-    if len(time) < 2 * SHORTEST * e.model.thin:
-        return []
-    begin = float(decay_window(e.table)[0][0])
-    middle, end = begin + float(time[len(time) // 2]), begin + float(time[-1])
-    settings = e.table.settings
-    spans = (replace(settings, start=begin, stop=middle), replace(settings, start=middle, stop=end))
-    tables = [replace(e.table, settings=span) for span in spans]
-    return [e.with_model(e.model, table=table) for table in tables]
-
-
 def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> dict[str, tuple[float, float]]:
     """Estimate and standard error of each physical parameter from one half, from the values ``theta`` of the whole."""
     if half.closed and not half.model.whitened:
@@ -308,7 +296,6 @@ def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> dict[str, tuple
 
 check_halves = halves(changes_of_second_half)
 check_positions = each("decays.position", position)
-check_size_of_residuals = each("decays.residuals", size_of_residuals)
 check_drift = each("decays.drift", drift, joined=False)
 check_zero = each("decays.zero", zero_jumps)
 
@@ -357,7 +344,7 @@ class FreeVibration(DecayRecord):
         check_halves,
         check_aliases,
         check_positions,
-        check_size_of_residuals,
+        each("decays.residuals", size_of_residuals),
         check_found_forces,
         check_drift,
         check_zero,
@@ -370,19 +357,16 @@ class FreeVibration(DecayRecord):
     def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
         return second_models(records, readings)
 
-    def starts(self) -> dict[str, Start]:
-        return decay_starts(self)
-
-    def nested_starts(self) -> Sequence[Mapping[str, float]]:
-        return nested_starts(self)
-
     def noise_facts(self) -> Facts:
-        present, tone = self.model.additions, None if self.model.hum else other_tone(self.time, self.values)
-        facts = {
+        return {
             "model": "decay",
-            "present": present,
+            "present": [
+                *(EFFECTS[symbol] for symbol in self.model.symbols),
+                *["drift of the zero"] * (self.model.drift != "none"),
+                *["hum"] * bool(self.model.hum),
+            ],
             "second": self.replaced,
-            "tone": tone,
+            "tone": None if self.model.hum else other_tone(self.time, self.values),
             "stated": self.stated_words,
+            **later_start(self),
         }
-        return {**facts, **later_start(self)}

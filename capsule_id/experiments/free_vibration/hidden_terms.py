@@ -45,7 +45,16 @@ def sensitivities(
     """
     raw, design = e.unwhitened(theta, np)
     nuisances = np.linalg.lstsq(e.whitened(theta, design), e.whitened(theta, raw), rcond=None)[0]
-    left, units, moved = raw - design @ nuisances, _units(e, theta), {}
+    left, size, k1, m1 = raw - design @ nuisances, e.largest_deflection, theta["k1"], theta["m1"]
+    # Natural units of the parameters, SI.
+    units = {
+        "k1": k1,
+        "c": max(theta["c"], SMALLEST_C * float(np.sqrt(k1 * m1))),
+        **natural_units(k1, m1, size),
+        "amplitude": size,
+        "turning_time": float(np.sqrt(m1 / k1)),
+    }
+    moved = {}
     for name in names or ("k1", "c", *e.model.symbols, *e.own_symbols):
         other, basis = e.unwhitened({**theta, name: theta[name] + SENSITIVITY_STEP * units[name]}, np)
         moved[name] = (other - basis @ nuisances - left) / (SENSITIVITY_STEP * units[name])
@@ -85,14 +94,6 @@ def force_responses(e: DecayRecord, theta: Mapping[str, float]) -> dict[str, np.
     return found
 
 
-def _units(e: Decay, theta: Mapping[str, float]) -> dict[str, float]:
-    """Natural units of the parameters of a decay, SI."""
-    size, k1, m1 = e.largest_deflection, theta["k1"], theta["m1"]
-    c = max(theta["c"], SMALLEST_C * float(np.sqrt(k1 * m1)))
-    motion = {"amplitude": size, "turning_time": float(np.sqrt(m1 / k1))}
-    return {"k1": k1, "c": c, **natural_units(k1, m1, size), **motion}
-
-
 # zero: A zero of the sensor that jumps where the rod turns, as of an encoder that loses counts or of a loose sensor.
 
 
@@ -122,11 +123,9 @@ def zero_jumps(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | N
     end = MOST_HALF_SWINGS * half
     if e.order > 0 or np.count_nonzero(time <= end) < FEWEST_OF_ALL:
         return None
-    begin = float(decay_window(e.table)[0][0])
-    settings = replace(e.table.settings, start=begin, stop=begin + float(min(end, time[-1])))
     thin = block_size(time[time <= end], values[time <= end], 2.0 * MOST_READINGS)
     model = replace(e.model, thin=thin, noise="white", drift="none")
-    part = e.with_model(model, table=replace(e.table, settings=settings))
+    part = e.between(0.0, float(min(end, time[-1])), model)
     left, design, moved = sensitivities(part, theta)
     curve = part.values - left
     rate = np.gradient(curve, part.time)

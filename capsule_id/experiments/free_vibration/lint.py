@@ -11,13 +11,11 @@ from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
     DAMPING,
     EFFECTS,
-    KINEMATIC_MESSAGES,
     MOST_PERIODS,
     DecayModel,
     block_size,
     default_block_size,
     first_periods,
-    lint_kinematics,
     release_time,
     window_of,
 )
@@ -33,7 +31,15 @@ from capsule_id.experiments.lint import (
     wrong_prefix,
 )
 from capsule_id.parameters import parameter
-from capsule_id.records.faults import aliases, sampling
+from capsule_id.records.faults import (
+    FEWEST_PERIODS,
+    OF_DERIVATIVE,
+    SIGN_ERRORS,
+    aliases,
+    derivative_ratio,
+    phasor,
+    sampling,
+)
 from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
 from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, uneven_sampling
@@ -57,7 +63,7 @@ USUAL_K1 = (1500.0, 1000.0)
 #: Factor of the prior that a finding proposes for k1: it holds no alias of 20 samples per period or more.
 PROPOSED_FACTOR = 10
 #: Smallest number of periods; with fewer, one peak determines the damping.
-FEWEST_PERIODS = 2
+WANTED_PERIODS = 2
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
@@ -94,12 +100,29 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         faults = faults or [
             found for name in channels for found in lint_smooth(table, name, used, period, name == "acceleration")
         ]
-        faults = faults or [*lint_kinematics(table, used, period)]
+        faults = faults or [*_kinematics(table, used, period)]
     yield from _named(table, release, faults)
     window = time[used], table[channels[0]][used]
     yield from _sampling(table, *window)
     if not faults:
         yield from _frequency(table, rig, *window)
+
+
+def _kinematics(table: Table[Any], used: slice, period: float) -> Iterable[Finding]:
+    """Report channels that contradict each other at the frequency 1/``period`` of the decay, Hz."""
+    first, *others = [name for name in CHANNELS if name in table.columns]
+    time, Omega = table["time"][used], 2.0 * np.pi / period
+    if table.settings.capsule != "held" or time[-1] - time[0] < FEWEST_PERIODS * period:
+        return
+    lower = phasor(time, table[first][used], Omega)
+    for name in others:
+        higher = phasor(time, table[name][used], Omega)
+        order = CHANNELS[name].order - CHANNELS[first].order
+        ratio = derivative_ratio(lower, higher, Omega, order).real
+        seen = all(abs(one.value) > SIGN_ERRORS * one.sd for one in (lower, higher))
+        if seen and not OF_DERIVATIVE[0] <= ratio <= OF_DERIVATIVE[1]:
+            facts = {"file": table.file, "name": name, "first": first, "order": order, "ratio": ratio}
+            yield Finding("decays.kinematics", "fail", facts, table.label)
 
 
 def _named(table: Table[Any], release: Sequence[Finding], faults: Sequence[Finding]) -> Iterable[Finding]:
@@ -256,14 +279,14 @@ def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterab
     by_means = settings.thin is None and settings.forward == "closed" and thin > 1
     longer = DecayModel.stated(settings).slow and cut != settings.stop
     few: Facts = {"samples": per_period, "wanted": SAMPLES_PER_PERIOD, "other": ""}
-    short: Facts = {"periods": periods, "wanted": FEWEST_PERIODS}
+    short: Facts = {"periods": periods, "wanted": WANTED_PERIODS}
     counted = even or not uneven
     rows: tuple[Row, ...] = (
         (by_means, "decays.thinned", "ok", means, ()),
         (longer, "decays.long", "warn", {"file": table.file, "stop": cut, "periods": MOST_PERIODS}, ()),
         (bool(uneven), "decays.uneven", "warn", uneven, ()),
         (counted and per_period < SAMPLES_PER_PERIOD, "decays.sampling", "warn", few, ("k1",) if even else ()),
-        (counted and periods < FEWEST_PERIODS, "decays.length", "warn", short, ()),
+        (counted and periods < WANTED_PERIODS, "decays.length", "warn", short, ()),
     )
     yield from _held(table, rows)
 
@@ -289,6 +312,19 @@ _OUTSIDE = (
     " If k1 is near {k1:.2g} N/m, state that: "
     'k1 = {{ median = {k1:.2g}, factor = {factor}, unit = "N/m" }} in [prior]. Else sample faster.',
 )
+
+
+def _contradiction(facts: Facts) -> str:
+    """The ratio of the two columns, and what to check."""
+    check, second = "Check the units of both columns.", "second " * (facts["order"] == 2)
+    low, high = OF_DERIVATIVE
+    if -high <= facts["ratio"] <= -low:
+        check = "One of them has the wrong sign: map it with scale = -1."
+    return (
+        f"{facts['file']}: {facts['name']} must be the {second}derivative of {facts['first']}; at the frequency of the "
+        f"decay it is {facts['ratio']:.3g} times that ({low:g} to {high:g} allowed). {check} Or leave one of "
+        f"them out."
+    )
 
 
 def _alias(texts: tuple[str, str], facts: Facts) -> str:
@@ -485,7 +521,7 @@ _FREE += line_of("start")
 
 MESSAGES = {
     **LINT_MESSAGES,
-    **KINEMATIC_MESSAGES,
+    "decays.kinematics": Message("columns of a decay", fail=_contradiction),
     "decays.hidden": Message(
         "further forces of a decay",
         ok="{labels}: no further force that the records allow changes c or k1 by much",

@@ -1,7 +1,7 @@
 """Readings of free decays: channels, block means, settings, and the window that contains the decay."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -9,13 +9,11 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
-from capsule_id.records.faults import FEWEST_PERIODS, OF_DERIVATIVE, SIGN_ERRORS, derivative_ratio, phasor
 from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
-from capsule_id.rig.filters import PIECE, loudest_part, median_step, uneven_sampling
+from capsule_id.rig.filters import loudest_part, median_step, uneven_sampling
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, PlainRule, QuantityRule, WordsRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE, Node, is_count, shown
-from capsule_id.views import Facts, Finding, Message
 
 # channels: Channels of a free decay: the displacement x_rel, its rate, or the rod's absolute acceleration.
 #
@@ -47,46 +45,6 @@ CHANNELS = {
 def channel_of(table: Table) -> str:
     """Column of the first channel of ``table``."""
     return next(name for name in CHANNELS if name in table.columns)
-
-
-# kinematics: Finding on the columns of a free decay: each further channel must be a derivative of the first one.
-
-
-#: Name of a derivative by its order.
-DERIVATIVES = {1: "derivative", 2: "second derivative"}
-
-
-def lint_kinematics(table: Table[Any], used: slice, period: float) -> Iterable[Finding]:
-    """Report channels that contradict each other at the frequency 1/``period`` of the decay, Hz."""
-    first, *others = [name for name in CHANNELS if name in table.columns]
-    time, Omega = table["time"][used], 2.0 * np.pi / period
-    if table.settings.capsule != "held" or time[-1] - time[0] < FEWEST_PERIODS * period:
-        return
-    lower = phasor(time, table[first][used], Omega)
-    for name in others:
-        higher = phasor(time, table[name][used], Omega)
-        order = CHANNELS[name].order - CHANNELS[first].order
-        ratio = derivative_ratio(lower, higher, Omega, order).real
-        seen = all(abs(one.value) > SIGN_ERRORS * one.sd for one in (lower, higher))
-        if seen and not OF_DERIVATIVE[0] <= ratio <= OF_DERIVATIVE[1]:
-            facts = {"file": table.file, "name": name, "first": first, "order": order, "ratio": ratio}
-            yield Finding("decays.kinematics", "fail", facts, table.label)
-
-
-def _contradiction(facts: Facts) -> str:
-    """The ratio of the two columns, and what to check."""
-    check = "Check the units of both columns."
-    low, high = OF_DERIVATIVE
-    if -high <= facts["ratio"] <= -low:
-        check = "One of them has the wrong sign: map it with scale = -1."
-    return (
-        f"{facts['file']}: {facts['name']} must be the {DERIVATIVES[facts['order']]} of {facts['first']}; at the frequency "
-        f"of the decay it is {facts['ratio']:.3g} times that ({low:g} to {high:g} allowed). {check} Or leave one of "
-        f"them out."
-    )
-
-
-KINEMATIC_MESSAGES = {"decays.kinematics": Message("columns of a decay", fail=_contradiction)}
 
 
 # blocks: Block means of a record: few readings that hold nearly all of its information on a decay.
@@ -139,20 +97,12 @@ def block_means(time: np.ndarray, values: np.ndarray, size: int, by_sample: bool
     if size == 1:
         one = np.ones((len(time), 1))
         return Blocks(time, values, time, time, one[:, 0], time[:, None], one)
-    if not is_even(time):
+    if is_even(time):
+        time, values = (part[: len(part) // size * size] for part in (time, values))
+        number = np.arange(len(time)) // size
+    else:
         width = size * median_step(time)
         number = np.unique(((time - time[0]) // width).astype(int), return_inverse=True)[1]
-        return _means(time, values, number, by_sample)
-    samples, step = len(time) // size * size, max(PIECE // size, 1) * size
-    parts = []
-    for first in range(0, samples, step):
-        part = slice(first, min(first + step, samples))
-        parts.append(_means(time[part], values[part], np.arange(part.stop - first) // size, by_sample))
-    return Blocks(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Blocks)))
-
-
-def _means(time: np.ndarray, values: np.ndarray, number: np.ndarray, by_sample: bool) -> Blocks:
-    """Means of the readings with each ``number`` (n,), which counts blocks from 0."""
     count = np.bincount(number).astype(float)
 
     def mean(x: np.ndarray) -> np.ndarray:
@@ -388,15 +338,6 @@ class DecayModel:
         return (*noise, *(("drift_ratio", "drift_time") if self.drift == "gp" else ()))
 
     @property
-    def additions(self) -> list[str]:
-        """Effects of the model that the default lacks, in words."""
-        return [
-            *(EFFECTS[symbol] for symbol in self.symbols),
-            *["drift of the zero"] * (self.drift != "none"),
-            *["hum"] * bool(self.hum),
-        ]
-
-    @property
     def name(self) -> str:
         """Words for tables and legends."""
         words = (
@@ -424,17 +365,12 @@ def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
     return table["time"][inside], table[channel_of(table)][inside]
 
 
-def stated_model(table: Table) -> DecayModel:
-    """Return the model that the settings of ``table`` state; a long record is thinned where they leave that open."""
-    thin = table.settings.thin or default_block_size(*decay_window(table))
-    return replace(DecayModel.stated(table.settings), thin=thin)
-
-
 def first_periods(table: Table[DecaySettings]) -> Table[DecaySettings]:
     """Return the table with a stop after ``MOST_PERIODS``, where none is stated and the record is longer."""
     time, values = decay_window(table)
-    last = MOST_PERIODS * block_size(time, values, 1.0)
-    if table.settings.stop is not None or last >= len(time) or block_size(time, values, 1.0) == 1:
+    period = block_size(time, values, 1.0)
+    last = MOST_PERIODS * period
+    if table.settings.stop is not None or last >= len(time) or period == 1:
         return table
     return replace(table, settings=replace(table.settings, stop=float(time[last])))
 

@@ -16,6 +16,7 @@ from tinygp.solvers.quasisep.core import DiagQSM, StrictLowerTriQSM, SymmQSM
 
 from capsule_id.experiments.base import (
     About,
+    Start,
     ValuesBySymbol,
     axis_label,
     band,
@@ -61,10 +62,10 @@ from capsule_id.experiments.free_vibration.readings import (
     block_means,
     channel_of,
     decay_window,
+    default_block_size,
     further_parameters,
     hum_columns,
     is_even,
-    stated_model,
 )
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
@@ -315,6 +316,19 @@ class Decay(SurfaceExperiment):
         )
 
 
+#: Start of a term that a simpler model lacks, relative to its usual start.
+ABSENT = 1e-4
+
+
+def force_starts(rough: Decrement, c: float, size: float) -> dict[str, Start]:
+    """Rough starts of the further forces of a decay whose first turning point is ``size`` m, by symbol."""
+    return {
+        "F_dry": Start(0.02 * rough.k1 * size, 0.3),
+        "c_q": Start(0.5 * c / (rough.Omega_o * size), 0.3),
+        "k_cubic": Start(0.0, 0.01 * rough.k1 / size**2),
+    }
+
+
 class DecayRecord(Decay):
     """One channel of one raw record; all records share k1, c and the parameters of further forces.
 
@@ -350,9 +364,12 @@ class DecayRecord(Decay):
     ) -> None:
         """Make one record; ``model`` None: as stated in the settings; ``screened`` gives starts."""
         self.friction = friction
-        self.model = model or stated_model(table)
         self.order = CHANNELS[channel_of(table)].order
         time, values = decay_window(table)
+        if model is None:  # a long record is thinned where its settings leave that open
+            stated = DecayModel.stated(table.settings)
+            model = replace(stated, thin=table.settings.thin or default_block_size(time, values))
+        self.model = model
         blocks = block_means(time - float(time[0]), values, self.model.thin, by_sample=self.order > 0)
         self.time, self.values, self.nodes, self.weights = blocks.time, blocks.values, blocks.nodes, blocks.weights
         self.times = ReadingTimes.of(blocks)
@@ -491,6 +508,12 @@ class DecayRecord(Decay):
         time, values = decay_window(self.table)
         return time - time[0], values
 
+    def between(self, first: float, last: float, model: DecayModel | None = None) -> Self:
+        """The readings between two times since the first one, s, with a model (default: that of all readings)."""
+        begin = float(decay_window(self.table)[0][0])
+        settings = replace(self.table.settings, start=begin + first, stop=begin + last)
+        return self.with_model(model or self.model, table=replace(self.table, settings=settings))
+
     @property
     def condensed(self) -> tuple[np.ndarray, np.ndarray]:
         """As ``whole``; of a long record block means, for the paper's estimate. Their times start at the first mean.
@@ -559,3 +582,64 @@ class DecayRecord(Decay):
     @property
     def cycles(self) -> np.ndarray:
         return self.time * self.rough.Omega_o / (2.0 * np.pi)
+
+    def starts(self) -> dict[str, Start]:
+        """Start of every parameter, from the paper's estimate or the values of a screening.
+
+        A viscous decay without drift starts at its least-squares fit, whose residuals show the noise at any sampling rate.
+        """
+        rough, noise = self.rough, noise_level(self.values)
+        if self.about.screened is not None:
+            noise = self.about.screened.noise / float(np.mean(self.relative_sd))
+        elif self.closed and self.model.drift == "none":
+            fit = viscous_fit(self.time, self.values)
+            rough, noise = (
+                fit.decrement(self.mass),
+                min(noise, float(np.sqrt(np.sum(fit.left**2) / max(self.n - UNKNOWNS, 1)))),
+            )
+        # A phase error of the start over the decay leads the fit to a side lobe, a local maximum.
+        ringing = min(self.time[-1], 4.0 * self.mass / rough.c)
+        spread = min(0.3, 1.0 / (rough.Omega_o * ringing))
+        noise = max(noise, 1e-4 * float(np.ptp(self.values)))
+        starts = {
+            "k1": Start(rough.k1, spread),
+            "c": Start(rough.c, 0.3),
+            self.channel.noise.named(self.label).name: Start(noise, 0.2),
+        }
+        if not self.closed:
+            time, peak = self.first_turning_point()
+            size = abs(peak)
+            forces = force_starts(rough, rough.c, size)
+            rough_damping = self.rough_damping(self.model.symbols)
+            forces |= {
+                name: Start(max(rough_damping.get(name, 0.0), 0.2 * forces[name].centre), 0.2)
+                for name in ("F_dry", "c_q")
+            }
+            starts |= {symbol: forces[symbol] for symbol in self.model.symbols} | {
+                "c": Start(max(rough_damping.get("c", rough.c), 0.1 * rough.c), 0.2),
+                f"amplitude[{self.label}]": Start(size, 0.05),
+                f"turning_time[{self.label}]": Start(time, 0.05 / rough.Omega_o),
+            }
+        known = {} if self.about.screened is None else self.about.screened.values
+        for row in self.parameters:
+            if row.symbol in known:
+                value = known[row.symbol]
+                near = starts.get(row.name, Start(value, 0.1))
+                # An absent term is no starting point of a logarithm.
+                floor = 1e-3 * near.centre if row.positive else -np.inf
+                starts[row.name] = Start(max(value, floor), 0.3 * near.spread)
+        return starts
+
+    def nested_starts(self) -> list[dict[str, float]]:
+        """Values by name, SI, of the fits of simpler models; an absent term is far below its usual start."""
+        if self.about.screened is None:
+            return []
+        usual = {name: start.centre for name, start in self.starts().items()}
+        return [
+            {
+                row.name: max(values[row.symbol], ABSENT * usual[row.name]) if row.positive else values[row.symbol]
+                for row in self.parameters
+                if row.symbol in values and row.name in usual
+            }
+            for values in self.about.screened.nested
+        ]

@@ -1,4 +1,4 @@
-"""Fits of single free decays: their starting points, and maximum likelihood with the noise level in closed form."""
+"""Fits of single free decays: maximum likelihood with the noise level in closed form."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
@@ -10,8 +10,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.console import stop_if_interrupted
-from capsule_id.experiments.base import Start
-from capsule_id.experiments.free_vibration.decrement import REFINED, UNKNOWNS, Decrement, viscous_fit
+from capsule_id.experiments.free_vibration.decrement import REFINED, viscous_fit
 from capsule_id.experiments.free_vibration.hidden_terms import SENSITIVITY_STEP
 from capsule_id.experiments.free_vibration.models import (
     STEPS,
@@ -33,82 +32,7 @@ from capsule_id.experiments.free_vibration.record import DecayRecord, ReadingTim
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.parameters import ROUNDING, SAME
 from capsule_id.physics.exact.engine import as_one_function
-from capsule_id.records.tones import NEAR, lasting_tone, noise_level
-
-# starts: Starting points of a fit of free decays.
-
-
-#: Start of a term that a simpler model lacks, relative to its usual start.
-ABSENT = 1e-4
-
-
-def force_starts(rough: Decrement, c: float, size: float) -> dict[str, Start]:
-    """Rough starts of the further forces of a decay whose first turning point is ``size`` m, by symbol."""
-    return {
-        "F_dry": Start(0.02 * rough.k1 * size, 0.3),
-        "c_q": Start(0.5 * c / (rough.Omega_o * size), 0.3),
-        "k_cubic": Start(0.0, 0.01 * rough.k1 / size**2),
-    }
-
-
-def decay_starts(e: DecayRecord) -> dict[str, Start]:
-    """Start of every parameter of the record ``e``, from its paper's estimate or the values of a screening.
-
-    A viscous decay without drift starts at its least-squares fit, whose residuals show the noise at any sampling rate.
-    """
-    rough, noise = e.rough, noise_level(e.values)
-    if e.about.screened is not None:
-        noise = e.about.screened.noise / float(np.mean(e.relative_sd))
-    elif e.closed and e.model.drift == "none":
-        fit = viscous_fit(e.time, e.values)
-        rough, noise = fit.decrement(e.mass), min(noise, float(np.sqrt(np.sum(fit.left**2) / max(e.n - UNKNOWNS, 1))))
-    # A phase error of the start over the decay leads the fit to a side lobe, a local maximum.
-    ringing = min(e.time[-1], 4.0 * e.mass / rough.c)
-    spread = min(0.3, 1.0 / (rough.Omega_o * ringing))
-    noise = max(noise, 1e-4 * float(np.ptp(e.values)))
-    starts = {
-        "k1": Start(rough.k1, spread),
-        "c": Start(rough.c, 0.3),
-        e.channel.noise.named(e.label).name: Start(noise, 0.2),
-    }
-    if not e.closed:
-        time, peak = e.first_turning_point()
-        size = abs(peak)
-        forces = force_starts(rough, rough.c, size)
-        rough_damping = e.rough_damping(e.model.symbols)
-        forces |= {
-            name: Start(max(rough_damping.get(name, 0.0), 0.2 * forces[name].centre), 0.2) for name in ("F_dry", "c_q")
-        }
-        starts |= {symbol: forces[symbol] for symbol in e.model.symbols} | {
-            "c": Start(max(rough_damping.get("c", rough.c), 0.1 * rough.c), 0.2),
-            f"amplitude[{e.label}]": Start(size, 0.05),
-            f"turning_time[{e.label}]": Start(time, 0.05 / rough.Omega_o),
-        }
-    known = {} if e.about.screened is None else e.about.screened.values
-    for row in e.parameters:
-        if row.symbol in known:
-            value = known[row.symbol]
-            near = starts.get(row.name, Start(value, 0.1))
-            # An absent term is no starting point of a logarithm.
-            floor = 1e-3 * near.centre if row.positive else -np.inf
-            starts[row.name] = Start(max(value, floor), 0.3 * near.spread)
-    return starts
-
-
-def nested_starts(e: DecayRecord) -> list[dict[str, float]]:
-    """Values by name, SI, of the fits of simpler models of the record ``e``; an absent term is far below its usual start."""
-    if e.about.screened is None:
-        return []
-    usual = {name: start.centre for name, start in decay_starts(e).items()}
-    return [
-        {
-            row.name: max(values[row.symbol], ABSENT * usual[row.name]) if row.positive else values[row.symbol]
-            for row in e.parameters
-            if row.symbol in values and row.name in usual
-        }
-        for values in e.about.screened.nested
-    ]
-
+from capsule_id.records.tones import NEAR, lasting_tone
 
 # fits: Maximum-likelihood fits of single decays, with the noise level in closed form, for the ranking of models.
 

@@ -31,8 +31,7 @@ from capsule_id.experiments.free_vibration.hidden_terms import (
 )
 from capsule_id.experiments.free_vibration.models import half_cycles
 from capsule_id.experiments.free_vibration.readings import DecayModel, decay_window, further_parameters
-from capsule_id.experiments.free_vibration.record import Decay, DecayAbout, Screened
-from capsule_id.experiments.free_vibration.screening import force_starts
+from capsule_id.experiments.free_vibration.record import Decay, DecayAbout, Screened, force_starts
 from capsule_id.experiments.free_vibration.second_fit import Demanded, replaced
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
@@ -221,9 +220,6 @@ def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Level] | N
     return facts, "ok" if best["z"] <= VISIBLE else "fail" if best["z"] > SIGNIFICANT and best["moved"] else "warn"
 
 
-check_forces, check_halves = each("decays.forces", forces), halves(changes_of_second_half)
-
-
 # second fit: Choice of the forces of turning points where the readings contradict the stated ones.
 #
 # A force is added where the readings demand it by ``SIGNIFICANT`` sds and exclude every other one in its place. Amplitudes
@@ -290,7 +286,7 @@ class TurningPoints(Decay):
 
     title = "turning points of a free decay"
     scatters: ClassVar[tuple[str, str]] = ("noise_sd", "time_sd")
-    checks = (check_steps, check_forces, check_halves, check_hidden_terms)
+    checks = (check_steps, each("decays.forces", forces), halves(changes_of_second_half), check_hidden_terms)
 
     def __init__(
         self,
