@@ -389,7 +389,7 @@ class ForcedRun(OtherRun):
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
         """The record through the paper's filter, and its drive; None where x_rel is not recorded, or not evenly."""
         try:
-            view = view_record(self.table, K=theta["K"] if self.driven_by_current else None)
+            view = view_record(self.table, K=theta["K"] if "current" in self.names else None)
         except InputError:
             return None
         return RunRecord(self.label, view, np.asarray(self.capsule(theta)[1].force_at(self.time)))

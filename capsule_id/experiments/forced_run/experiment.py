@@ -206,7 +206,7 @@ class CapsuleRun(CapsuleForward):
         rows += [*clock_parameters(self.table, self.rig), *instrument_parameters(self.table)]
         rows += self.friction.support(self.spring)
         rows += stated_parameters("G", settings.gap, whole)
-        if self.driven_by_current:
+        if "current" in self.names:
             amplitude = 0.5 * float(np.ptp(self.table["current"]))
             rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
         else:
@@ -307,10 +307,6 @@ class CapsuleRun(CapsuleForward):
         return self.table.settings.spring
 
     @property
-    def driven_by_current(self) -> bool:
-        return "current" in self.names
-
-    @property
     def observed(self) -> np.ndarray:
         """Readings channel by channel, then the stated P_d where the current is recorded too, SI."""
         return np.concatenate([*(channel.values for channel in self.channels), (self.second_reading or ())[:1]])
@@ -339,7 +335,7 @@ class CapsuleRun(CapsuleForward):
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         """Return parameters and drive of this run; leaves as in ``theta``."""
-        force = theta["K"] * theta["I_d"] if self.driven_by_current else {**self.exact, **theta}["P_d"]
+        force = theta["K"] * theta["I_d"] if "current" in self.names else {**self.exact, **theta}["P_d"]
         return self.parameters_of(theta), Excitation(force, self.Omega, theta["phase"], self.reaction)
 
     def true_time(self, theta: ValuesBySymbol) -> Any:
