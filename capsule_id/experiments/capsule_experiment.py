@@ -19,6 +19,7 @@ from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.record import DecayRecord
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
+    NORMAL_FORCE,
     FrictionModel,
     GroundExperiment,
     ground_of,
@@ -27,10 +28,10 @@ from capsule_id.experiments.friction_model import (
 )
 from capsule_id.experiments.point_test import PointTest
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.physics.forces import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory
 from capsule_id.physics.simulation import simulate
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.records.tones import stated_gap
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Facts
 
@@ -49,11 +50,21 @@ def stated_parameters(
     return [parameter(symbol, of, Prior(kind, stated.value, stated.sd))]
 
 
-def lag_of(table: Table, rig: Rig) -> tuple[list[Parameter], float | None]:
-    """The parameter lag of a drive, with its stated prior or, where [model] sets it free, the default one; or [] and s."""
+def lag_parameters(table: Table, rig: Rig) -> list[Parameter]:
+    """The parameter lag of a drive, with its stated prior or, where [model] sets it free, the default one; or []."""
     lag, is_free = table.settings.lag, table.settings.drive == "pulses" and "lag" in rig.model.free
-    rows = [parameter("lag")] if lag is None and is_free else stated_parameters("lag", lag)
-    return rows, None if rows else 0.0 if lag is None else lag.value
+    return [parameter("lag")] if lag is None and is_free else stated_parameters("lag", lag)
+
+
+#: Settings that hold a number of the motion, by symbol.
+STATED = {"G": "gap", "P_d": "P_d", "P_on": "P_on", "lag": "lag", "duty": "duty", NORMAL_FORCE: "normal_force"}
+
+
+def exact_values(table: Table) -> dict[str, float]:
+    """The numbers of the motion that the settings of ``table`` state without an sd, SI, by symbol."""
+    stated = {symbol: getattr(table.settings, key, None) for symbol, key in STATED.items()}
+    quantities = {name: q if isinstance(q, Quantity) else Quantity(q) for name, q in stated.items() if q is not None}
+    return {name: q.value for name, q in quantities.items() if q.sd == 0.0}
 
 
 def stated_starts(of: str, **quantities: Quantity | None) -> dict[str, Start]:
@@ -71,10 +82,12 @@ class CapsuleForward(GroundExperiment):
 
     Attributes
     ----------
+    exact : numbers of the motion that are no parameters, see ``exact_values``
     smoothing : widths of the smoothed model; None: the exact model
     reaction : share of the drive's force that pushes the capsule back, 1
     """
 
+    exact: dict[str, float]
     smoothing: Smoothing | None
     reaction: float = eqx.field(static=True)
 
@@ -83,8 +96,8 @@ class CapsuleForward(GroundExperiment):
     masses = ("m1", "m2")
 
     def set_model(self, table: Table, rig: Rig, friction: FrictionModel) -> None:
-        """Set friction law, ground, engine and reaction, as [model] and the table state them."""
-        self.friction, self.ground = friction, ground_of(table)
+        """Set friction law, ground, exact numbers, engine and reaction, as [model] and the table state them."""
+        self.friction, self.ground, self.exact = friction, ground_of(table), exact_values(table)
         self.read_instruments(table)
         self.smoothing = Smoothing() if rig.model.engine == "smooth" else None
         self.reaction = rig.model.share_of_reaction
@@ -98,8 +111,15 @@ class CapsuleForward(GroundExperiment):
             widths = NARROW
         return eqx.tree_at(lambda e: e.smoothing, self, widths, is_leaf=lambda x: x is None)
 
-    def parameters_of(self, theta: ValuesBySymbol, gap: Any) -> CapsuleParameters:
-        """Capsule parameters at ``theta``; mu and v_s are placeholders where another friction law replaces them."""
+    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
+        return super().law({**self.exact, **theta})
+
+    def parameters_of(self, theta: ValuesBySymbol) -> CapsuleParameters:
+        """Capsule parameters at ``theta``; mu and v_s are placeholders where another friction law replaces them.
+
+        k2 is 0, and the gap infinite, where there is no support spring.
+        """
+        gap = {**self.exact, **theta}.get("G", np.inf)
         return CapsuleParameters(
             m1=theta["m1"],
             m2=theta["m2"],
@@ -145,8 +165,6 @@ class CapsuleDecay(CapsuleForward, DecayRecord):
     Initial conditions and offset belong to the record. With ``spring`` and ``gap`` the rod may hit the support spring.
     """
 
-    gap: float | None
-
     model_name = "capsule model"  # pyright: ignore[reportAssignmentType]
     #: The capsule takes energy when it slips, so that no period repeats.
     cycles = None  # pyright: ignore[reportAssignmentType]
@@ -155,11 +173,9 @@ class CapsuleDecay(CapsuleForward, DecayRecord):
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         DecayRecord.__init__(self, table, rig, friction, DecayModel())
         self.set_model(table, rig, friction)
-        gap = stated_gap(table)
-        self.gap = gap.value if gap.sd == 0.0 else None
         rows = [parameter("k1"), parameter("c"), *friction.parameters]
         rows += [] if table.settings.gap is None else friction.support(table.settings.spring)
-        rows += stated_parameters("G", gap, table.label)
+        rows += stated_parameters("G", table.settings.gap, table.label)
         rows.append(parameter("x_start", table.label, Prior("normal", 0.0, self.width)))
         rows.append(parameter("y_start", table.label, Prior("normal", 0.0, self.width * self.rough.Omega_o)))
         rows += [NOISE_SD.named(table.label, scatter_prior(float(np.ptp(self.values)))), *ground_parameters(table, rig)]
@@ -167,10 +183,9 @@ class CapsuleDecay(CapsuleForward, DecayRecord):
         self.about = replace(self.about, parameters=tuple(rows))
 
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
-        p = self.parameters_of(theta, theta["G"] if self.gap is None else self.gap)
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
         times = jnp.multiply.outer(stretch(self.clock_rate, theta), self.time)
-        t = self.simulated(theta, p, OFF, times, initial)
+        t = self.simulated(theta, self.parameters_of(theta), OFF, times, initial)
         return self.values - xp.asarray(t.X1 - t.X2), self.width * xp.ones((self.n, 1))
 
     def unstated_errors(self, symbol: str) -> set[str]:
@@ -212,5 +227,5 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         v = jnp.asarray(x["speed"])
         still, end = jnp.zeros_like(v), jnp.asarray(self.horizon)
         times = jnp.stack([still, end], axis=1)
-        t = self.simulated(theta, self.parameters_of(theta, np.inf), OFF, times, (still, v, still, v))
+        t = self.simulated(theta, self.parameters_of(theta), OFF, times, (still, v, still, v))
         return t.X2[:, -1]

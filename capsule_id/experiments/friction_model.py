@@ -124,11 +124,6 @@ class FrictionModel:
         return ", ".join(words if self.contact is None else [*words, f"contact {self.contact.__name__}"])
 
     @property
-    def is_proportional(self) -> bool:
-        """Whether the law is proportional to the normal force, so that a coefficient needs no mass."""
-        return self.law is CoulombStribeck and "viscous" not in self.free
-
-    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The sampled parameters."""
         unseen = {"forward": "mu_back", "backward": "mu"}.get(self.direction) if "mu_back" in self.free else None
@@ -145,7 +140,7 @@ class FrictionModel:
     def parameters_at_rest(self) -> tuple[Parameter, ...]:
         """Parameters that change the break-away force at some prior draw: mu alone in eq. (1)."""
         rng = np.random.default_rng(0)
-        draws = {row.symbol: _prior_of(row).sample(rng, PRIOR_DRAWS) for row in self.parameters}
+        draws = {row.symbol: cast(Prior, row.prior).sample(rng, PRIOR_DRAWS) for row in self.parameters}
         still = np.zeros(PRIOR_DRAWS)
         force = np.asarray(self._at(draws, 1.0).forward(still))
 
@@ -159,8 +154,8 @@ class FrictionModel:
 
     @property
     def masses(self) -> tuple[str, ...]:
-        """Symbols of the masses that the coefficient depends on."""
-        return () if self.is_proportional else ("m1", "m2")
+        """Symbols of the masses that the coefficient depends on: none where the law is proportional to the normal force."""
+        return () if self.law is CoulombStribeck and "viscous" not in self.free else ("m1", "m2")
 
     @property
     def source(self) -> str:
@@ -194,13 +189,13 @@ class FrictionModel:
     def coefficient(self, theta: ValuesBySymbol) -> FrictionLaw:
         """Resistance per weight (m1 + m2) g at ``theta``, 1; theta has ``masses`` and g."""
         # Without masses only the break-away coefficient is read, and nothing viscous acts at rest.
-        if self.is_proportional or (self.law is CoulombStribeck and not {"m1", "m2"} <= set(theta)):
+        if not self.masses or (self.law is CoulombStribeck and not {"m1", "m2"} <= set(theta)):
             return self._at(theta, 1.0)
         return scaled(self.force(theta), 1.0 / _weight(theta))
 
     def _at(self, theta: ValuesBySymbol, N: Any) -> FrictionLaw:
         # Parameters that tilts do not sample have no effect at rest, so any value is valid there.
-        known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in self._varied}
+        known = {row.symbol: theta.get(row.symbol, cast(Prior, row.prior).median) for row in self._varied}
         constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
         law = cast(Any, self.law)(**known, **constant, **(CONSTANT if self.constant else {}))
         return Reversed(law) if self.direction == "backward" else law
@@ -236,11 +231,6 @@ def _check_leaves(role: str, law: type, held: str, holds: str, make: Callable[[]
             f"leaves: {len(leaves)}",
             "add @jax.tree_util.register_dataclass above @dataclass",
         )
-
-
-def _prior_of(row: Parameter) -> Prior:
-    assert row.prior is not None, "a friction model refuses rows without a prior"
-    return row.prior
 
 
 def _weight(theta: ValuesBySymbol) -> Any:
@@ -305,8 +295,8 @@ def has_stated_load(table: Table[Any]) -> bool:
 
 def _acting_ground(table: Table[Any]) -> dict[str, Quantity]:
     """Stated slope and N0 that act on the readings."""
-    held = has_stated_load(table)
-    return {name: stated for name, stated in table.settings.ground.items() if name != "N0" or not held}
+    stated, held = getattr(table.settings, "ground", {}), has_stated_load(table)
+    return {name: quantity for name, quantity in stated.items() if name != "N0" or not held}
 
 
 def ground_of(table: Table[Any]) -> dict[str, float | None]:

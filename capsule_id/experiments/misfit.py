@@ -133,11 +133,8 @@ class ScaledMisfit:
 
     def at_nuisance_draw(self, rng: np.random.Generator) -> np.ndarray:
         """Residuals (n,) in units of the noise at one draw of the nuisances given the readings."""
-        raw = self.raw
-        if self.design.shape[1]:
-            _, ay, aa = self.moments()
-            raw = raw - self.design @ conditional_draw(ay, aa, rng)
-        return raw / self.sd
+        _, ay, aa = self.moments()
+        return (self.raw - self.design @ conditional_draw(ay, aa, rng)) / self.sd
 
     def left_out(self, first: np.ndarray, xp: ModuleType = jnp) -> Any:
         """(blocks,) log-density of each block of readings given all others, nuisances integrated out.

@@ -41,7 +41,7 @@ from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
 from capsule_id.parameters import SAME, STEP_SD, Parameter, parameter
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.rig.schema import Entry, GroundSettings
+from capsule_id.rig.schema import Entry
 from capsule_id.views import Comparison, Curve, Finding, Message, Points, ResultTable
 
 #: Name of the friction law of the fit in ``PointTest.reads``.
@@ -75,13 +75,12 @@ class PointTest(GroundExperiment):
     on_track: ClassVar[bool] = True
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        on_track = self.on_track and isinstance(table.settings, GroundSettings)
         self.friction = replace(friction, direction=getattr(table.settings, "direction", friction.direction))
-        self.ground = ground_of(table) if on_track else {}
+        self.ground = ground_of(table) if self.on_track else {}
         self.readings, self.sds = self.read(table)
         others = (name for name in self.sds if name != self.reading)
         self.uncertain = tuple(name for name in others if np.any(np.asarray(self.sds[name]) > 0.0))
-        ground = ground_parameters(table, rig) if on_track else ()
+        ground = ground_parameters(table, rig) if self.on_track else ()
         self.read_instruments(table)
         self.about = About(table, rig, (*self.own_parameters(table), *ground, *instrument_parameters(table)))
 
@@ -508,8 +507,8 @@ class Line(PointTest):
         self.sds = {**self.sds, self.reading: max(self.sds[self.reading], self.step * STEP_SD)}
 
     def slope_of(self, table: Table) -> Parameter:
-        """Row of the slope."""
-        return parameter(self.symbol)
+        """Row of the slope: of the spring that the settings name, or of the rig."""
+        return parameter(self.symbol, getattr(table.settings, "spring", ""))
 
     def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
         slope, prior = self.slope_of(table), scatter_prior(float(np.ptp(self.observed)))

@@ -10,8 +10,8 @@ from scipy import stats
 from capsule_id.experiments.base import LEVEL, Fitted, refit
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.point_test import LINE_MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.parameters import INSTRUMENT_ERRORS, SPRINGS, Parameter, by_index, parameter
-from capsule_id.rig.model import Quantity, Settings, Table
+from capsule_id.parameters import INSTRUMENT_ERRORS, SPRINGS, by_index
+from capsule_id.rig.model import Quantity, Settings
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Finding, Message
 
@@ -140,6 +140,3 @@ class SupportSpring(Line):
 
     x_name, reading, symbol = "deflection", "force", "k2"
     checks = (*Line.checks, check_cantilever)
-
-    def slope_of(self, table: Table) -> Parameter:
-        return parameter(self.symbol, table.settings.spring)

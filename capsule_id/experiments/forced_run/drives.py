@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import LEVEL, Fitted, Start, ValuesBySymbol, axis_label, band, stacked, stretch
-from capsule_id.experiments.capsule_experiment import lag_of
 from capsule_id.experiments.forced_run.declaration import SETTLING_PERIODS
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
@@ -390,7 +389,7 @@ class ForcedRun(OtherRun):
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
         """The record through the paper's filter, and its drive; None where x_rel is not recorded, or not evenly."""
         try:
-            view = view_record(self.table, K=theta["K"] if self.driven_by_current else None)
+            view = view_record(self.table, K=theta["K"] if "current" in self.names else None)
         except InputError:
             return None
         return RunRecord(self.label, view, np.asarray(self.capsule(theta)[1].force_at(self.time)))
@@ -417,35 +416,20 @@ class RecordedRun(OtherRun):
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         force = jnp.multiply.outer(jnp.asarray(theta["K"]), self.current)
-        return self.with_spring(theta), RecordedDrive(self.true_time(theta), force, self.reaction)
+        return self.parameters_of(theta), RecordedDrive(self.true_time(theta), force, self.reaction)
 
     def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
-        p, K = before_samples((self.with_spring(theta), theta["K"]), xp)
+        p, K = before_samples((self.parameters_of(theta), theta["K"]), xp)
         return (K * self.current - rod_on_capsule(p, x_rel, rate) - downhill(p, p.m1)) / p.m1
 
 
 class PulseRun(OtherRun):
-    """One record driven by pulses of stated period and duty, which act since long before the first sample.
-
-    Attributes
-    ----------
-    duty, P_on, lag : 1, N, s; stated, None where they are parameters
-    """
-
-    duty: float
-    P_on: float | None
-    lag: float | None
-
-    def read_drive(self, table: Table, rig: Rig) -> None:
-        force = table.settings.P_on
-        self.duty, self.P_on = table.settings.duty, force.value if force.sd == 0.0 else None
-        self.lag = lag_of(table, rig)[1]
+    """One record driven by pulses of stated period and duty, which act since long before the first sample."""
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
-        force: Any = theta["P_on"] if self.P_on is None else self.P_on
-        lag: Any = theta["lag"] if self.lag is None else self.lag
-        wave = 2.0 * np.pi / self.Omega, self.duty
-        return self.with_spring(theta), Pulses(force, *wave, phase=theta["phase"], lag=lag, reaction=self.reaction)
+        own = {"lag": 0.0, **self.exact, **theta}
+        wave = own["P_on"], 2.0 * np.pi / self.Omega, own["duty"]
+        return self.parameters_of(theta), Pulses(*wave, phase=own["phase"], lag=own["lag"], reaction=self.reaction)
 
     def simulated(
         self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
@@ -488,7 +472,7 @@ class BaseRun(OtherRun):
     @property
     def masses(self) -> tuple[str, ...]:
         # The rod's mass acts through the normal force alone.
-        return ("m2",) if self.normal_force is not None or self.rig.m1 is None else ("m1", "m2")
+        return ("m2",) if NORMAL_FORCE in self.exact or self.rig.m1 is None else ("m1", "m2")
 
     def first_state(self, table: Table) -> RunStart:
         relative = relative_position(table)
@@ -520,4 +504,4 @@ class BaseRun(OtherRun):
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Any]:
         X1, time = jnp.add.outer(theta["x_start"], self.base), self.true_time(theta)
         rate = jnp.multiply.outer(1.0 / stretch(self.clock and self.clock[0], theta), self.base_rate)
-        return self.with_spring({"m1": 0.0, **theta}), RodMotion(time, X1, rate)
+        return self.parameters_of({"m1": 0.0, **theta}), RodMotion(time, X1, rate)

@@ -11,7 +11,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, scatter_prior, stated_rate, stretch
-from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters, stated_starts
+from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_parameters, stated_parameters, stated_starts
 from capsule_id.experiments.forced_run.declaration import (
     CAPSULE_START,
     CORRELATION,
@@ -27,7 +27,6 @@ from capsule_id.experiments.forced_run.start_state import (
 )
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
-    NORMAL_FORCE,
     FrictionModel,
     ground_parameters,
     instrument_parameters,
@@ -35,9 +34,9 @@ from capsule_id.experiments.friction_model import (
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
 from capsule_id.experiments.statistics import autocorrelation
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.physics.forces import FrictionLaw, equilibrium
+from capsule_id.physics.forces import equilibrium
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory, rod_acceleration
-from capsule_id.records.tones import stated_gap, stated_Omega
+from capsule_id.records.tones import stated_Omega
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Facts, Finding
 
@@ -124,10 +123,8 @@ class CapsuleRun(CapsuleForward):
     Attributes
     ----------
     time : (n,) s
-    gap, force : gap, m, and amplitude of the drive, N; None where they are parameters
     second_reading : amplitude of the drive beside that from the current, and its sd, N; None: there is none
     moves : factor of ``capsule_start``, 0 or 1, so that one program computes runs of both kinds
-    normal_force : stated, N; None: it is the weight
     clock : 1 + the stated drift of the clock, and the middle of the whole record, s; None: an exact clock
     first : time of the first sample of the whole record, s
     """
@@ -136,11 +133,8 @@ class CapsuleRun(CapsuleForward):
     time: np.ndarray
     channels: tuple[Channel, ...]
     Omega: float
-    gap: float | None
-    force: float | None
     second_reading: tuple[float, float] | None
     moves: float
-    normal_force: float | None
     clock: tuple[float, float] | None
     first: float
     settled: bool = eqx.field(static=True)
@@ -174,7 +168,7 @@ class CapsuleRun(CapsuleForward):
         """
         self.read_drive(table, rig)
         self.set_model(table, rig, friction)
-        settings, gap = table.settings, stated_gap(table)
+        settings = table.settings
         self.channels = tuple(
             Channel(table, name) for name in NOISE if name in table.columns and name not in self.inputs
         )
@@ -185,11 +179,8 @@ class CapsuleRun(CapsuleForward):
         whole = next((other for other in rig.tables if other.label == part_of), table)["time"]
         rate, self.first = stated_rate(table), float(whole[0])
         self.clock = None if rate is None else (rate, 0.5 * float(whole[0] + whole[-1]))
-        self.gap = gap.value if gap.sd == 0.0 else None
         P_d, by_current = settings.P_d, "current" in self.names
         self.second_reading = (P_d.value, P_d.sd) if P_d and P_d.sd > 0.0 and by_current and leads else None
-        self.force = None if by_current or (P_d and P_d.sd > 0.0) else P_d and P_d.value
-        self.normal_force = settings.normal_force
         self.coloured = coloured or settings.noise == "ar1"
         rough = self.first_state(table)
         rough = rough if capsule_rate is None else replace(rough, capsule_rate=capsule_rate)
@@ -215,13 +206,13 @@ class CapsuleRun(CapsuleForward):
         rows += [*clock_parameters(self.table, self.rig), *instrument_parameters(self.table)]
         rows += self.friction.support(self.spring)
         rows += stated_parameters("G", settings.gap, whole)
-        if self.driven_by_current:
+        if "current" in self.names:
             amplitude = 0.5 * float(np.ptp(self.table["current"]))
             rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
         else:
             rows += stated_parameters("P_d", settings.P_d, whole)
         rows += [parameter("K")] if "current" in self.inputs else []
-        rows += [*stated_parameters("P_on", settings.P_on, kind="normal"), *lag_of(self.table, self.rig)[0]]
+        rows += [*stated_parameters("P_on", settings.P_on, kind="normal"), *lag_parameters(self.table, self.rig)]
         if not (self.inputs or self.prescribed):
             rows.append(parameter("phase", whole, Prior("normal", 0.0, np.pi)))  # wide but proper
         length = NUISANCE_WIDTH * self.rough.length
@@ -316,10 +307,6 @@ class CapsuleRun(CapsuleForward):
         return self.table.settings.spring
 
     @property
-    def driven_by_current(self) -> bool:
-        return "current" in self.names
-
-    @property
     def observed(self) -> np.ndarray:
         """Readings channel by channel, then the stated P_d where the current is recorded too, SI."""
         return np.concatenate([*(channel.values for channel in self.channels), (self.second_reading or ())[:1]])
@@ -346,18 +333,10 @@ class CapsuleRun(CapsuleForward):
 
     # -- the motion and its recorded channels -----------------------------------------------------------------------
 
-    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
-        return super().law(theta if self.normal_force is None else {**theta, NORMAL_FORCE: self.normal_force})
-
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         """Return parameters and drive of this run; leaves as in ``theta``."""
-        stated: Any = theta.get("P_d") if self.force is None else self.force
-        force = theta["K"] * theta["I_d"] if self.driven_by_current else stated
-        return self.with_spring(theta), Excitation(force, self.Omega, theta["phase"], self.reaction)
-
-    def with_spring(self, theta: ValuesBySymbol) -> CapsuleParameters:
-        """Parameters at ``theta`` with the support spring of this run; k2 = 0 where there is none."""
-        return self.parameters_of(theta, theta["G"] if self.gap is None else self.gap)
+        force = theta["K"] * theta["I_d"] if "current" in self.names else {**self.exact, **theta}["P_d"]
+        return self.parameters_of(theta), Excitation(force, self.Omega, theta["phase"], self.reaction)
 
     def true_time(self, theta: ValuesBySymbol) -> Any:
         """Times of the samples (..., n), s, with the drift of the clock at ``theta``."""

@@ -249,16 +249,14 @@ KIND = Kind(
 def settings_of(columns: Mapping[str, Column], settings: ProgressionSettings) -> tuple[np.ndarray, str]:
     """(n, 4) period, s, number of periods, duty and amplitude of every row; where the amplitude comes from.
 
-    The amplitude is from a "column" (N) or a "current" (A), or a parameter with a "prior", or "exact"; it is 1 in the last
-    two cases.
+    The amplitude is from a "column" (N) or a "current" (A), or from a "setting"; it is 1 in the last case.
     """
     values = {name: column.values for name, column in columns.items()}
     period = values["period"] if "period" in values else 1.0 / values["f"]
     one = np.ones(len(period))
     own = AMPLITUDE[settings.drive]
     source = next((name for name in (own, "current") if name in columns), None)
-    stated = getattr(settings, own)
-    kind = {own: "column", "current": "current"}.get(source or "", "prior" if stated and stated.sd > 0.0 else "exact")
+    kind = {own: "column", "current": "current"}.get(source or "", "setting")
     amplitude = one if source is None else values[source]
     return np.stack([period, values["periods"], values.get("duty", one), amplitude], axis=1), kind
 

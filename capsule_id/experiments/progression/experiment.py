@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.experiments.base import About, Fitted, Start, ValuesBySymbol, band, stacked
-from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters
+from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_parameters, stated_parameters
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, ground_parameters
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.progression.declaration import (
@@ -135,7 +135,6 @@ class Progression(CapsuleForward):
     session : (n, sessions) 1 where a row belongs to it
     parameter : (sessions,) index of the parameter of a session, see ``parameters_of``
     reading_variance : m^2
-    force, lag : stated amplitude, N, else 0; lag, s, None where it is a parameter
     heavy : whether trials have heavy tails, see ``capsule_id.experiments.progression.declaration``
     emulator : of ``runs``; None: they are exact
     """
@@ -149,8 +148,6 @@ class Progression(CapsuleForward):
     sessions: Sessions
     groups: TrialGroups
     reading_variance: float
-    force: float
-    lag: float | None
     drive: str = eqx.field(static=True)
     amplitude_from: str = eqx.field(static=True)
     heavy: bool = eqx.field(static=True)
@@ -174,11 +171,8 @@ class Progression(CapsuleForward):
         parameter = parameters_of(setting, session)
         for name, value in self._cases(table["distance"], settings, setting, session, parameter).items():
             setattr(self, name, value)
-        stated = getattr(table.settings, AMPLITUDE[self.drive])
-        self.force = stated.value if stated is not None and stated.sd == 0.0 else 0.0
-        lag, self.lag = lag_of(table, rig)
         self.about = About(table, rig, ())
-        self.about = replace(self.about, parameters=self._sampled(lag))
+        self.about = replace(self.about, parameters=self._sampled())
 
     def _cases(
         self,
@@ -201,13 +195,14 @@ class Progression(CapsuleForward):
             "groups": TrialGroups(distance, sessions, self.heavy),
         }
 
-    def _sampled(self, lag: list[Parameter]) -> tuple[Parameter, ...]:
+    def _sampled(self) -> tuple[Parameter, ...]:
         settings, free = self.table.settings, self.rig.model.free
         rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
         rows += [parameter("k_cubic")] if "k_cubic" in free else []
         name = AMPLITUDE[self.drive]
         rows += [parameter("K")] if self.amplitude_from == "current" else []
-        rows += stated_parameters(name, getattr(settings, name), kind="normal") + lag
+        rows += stated_parameters(name, getattr(settings, name), kind="normal")
+        rows += lag_parameters(self.table, self.rig)
         largest = float(np.max(np.abs(self.distance)))
         speed = float(np.max(np.abs(self.distance / (self.setting @ self.time))))
         floor = np.sqrt(self.reading_variance) + 1e-9
@@ -237,25 +232,21 @@ class Progression(CapsuleForward):
 
     @property
     def mirrored(self) -> tuple[str, ...]:
-        return (AMPLITUDE[self.drive],) if self.amplitude_from == "prior" else ()
+        own = AMPLITUDE[self.drive]
+        return (own,) if self.amplitude_from == "setting" and own not in self.exact else ()
 
     # -- the forward model --------------------------------------------------------------------------------------------
 
     def capsule(self, theta: ValuesBySymbol, settings: Any) -> tuple[CapsuleParameters, Drive]:
         """Parameters and drive at rows of ``settings`` (rows, 4), leaves () or (rows,)."""
         period, _, duty, amplitude = settings.T
-        force = {
-            "column": amplitude,
-            "current": theta.get("K", 0.0) * amplitude,
-            "prior": theta.get(AMPLITUDE[self.drive], 0.0) + 0.0 * period,
-            "exact": self.force + 0.0 * period,
-        }[self.amplitude_from]
-        p = self.parameters_of(theta, np.inf)
+        own = {"lag": 0.0, **self.exact, **theta}
+        unit = {"column": 1.0, "current": theta.get("K", 0.0), "setting": own.get(AMPLITUDE[self.drive], 0.0)}
+        force = unit[self.amplitude_from] * amplitude
+        p = self.parameters_of(theta)
         if self.drive == "harmonic":
             return p, Excitation(force, 2.0 * np.pi / period, 0.0, self.reaction)
-        return p, Pulses(
-            force, period, duty, lag=theta["lag"] if self.lag is None else self.lag, reaction=self.reaction
-        )
+        return p, Pulses(force, period, duty, lag=own["lag"], reaction=self.reaction)
 
     def runs(self, theta: ValuesBySymbol) -> Any:
         """(..., runs) X2 of the runs of ``sessions``, m, by the exact or the smoothed engine; see ``displacements``."""
@@ -336,7 +327,7 @@ class Progression(CapsuleForward):
             "mu_back": Start(FRICTION, 0.5),
             "v_s": Start(0.3, 1.0),
             "ratio": Start(0.7, 0.3),
-            **({"lag": Start(0.05 * float(np.median(self.settings[:, 0])), 1.0)} if self.lag is None else {}),
+            **({"lag": Start(0.05 * float(np.median(self.settings[:, 0])), 1.0)} if "lag" in priors else {}),
             "session_sd": Start(0.05, 0.3),
             **{f"{symbol}[{self.label}]": Start(0.0, 1.0) for symbol in self.sessions.symbols},
             "trial_scatter": Start(0.05, 0.3),
