@@ -234,7 +234,7 @@ def run(args: argparse.Namespace) -> int:
             measured, sentence = overlay(rig, axes[0].name, axes[0].values, values, fitted, by_name)
             complain(sentence)
         with own_style():
-            figure = png(draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+            figure = png(draw(data, axes, measured), synthetic=rig is not None and rig.synthetic)
         with refusing("the output must be writable", "choose another --out", out):
             out.parent.mkdir(parents=True, exist_ok=True)
             replace_files({out: netcdf_bytes(data), out.with_suffix(".png"): figure})
@@ -244,24 +244,17 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def draw(
-    data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredPoint]" = (), synthetic: bool = False
-) -> "Figure":
+def draw(data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredPoint]" = ()) -> "Figure":
     """The figure of a computed Dataset. A diagram also shows measured runs, each with its own label."""
     from capsule_id.report.figures import sweeps
-    from capsule_id.report.figures.style import mark
 
     drawn = sweeps.in_units(data, {axis.name: (axis.unit, axis.factor) for axis in axes})
     title = str(data.attrs["rig"])
     if "probability" in data:
-        figure = sweeps.bands(drawn, title)
-    elif len(axes) == 2:
-        figure = sweeps.motion_map(drawn, title)
-    else:
-        figure = sweeps.bifurcation(drawn, measured, title)
-    if synthetic:
-        mark(figure, "synthetic data")
-    return figure
+        return sweeps.bands(drawn, title)
+    if len(axes) == 2:
+        return sweeps.motion_map(drawn, title)
+    return sweeps.bifurcation(drawn, measured, title)
 
 
 def _dataset(

@@ -36,15 +36,14 @@ def run(args: argparse.Namespace) -> int:
     prepare_jax(not args.no_cache)
     from capsule_id.api import load
     from capsule_id.inference.prediction import predict
-    from capsule_id.report.figures.fits import side_by_side
-    from capsule_id.report.figures.style import own_style, png
+    from capsule_id.report.figures import fits, style
 
     made = predict(load(args.result), args.settings, seed=args.seed)
     table = made.table.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode()
     written = [("--out", args.out, table)]
     if args.figure is not None:
-        with own_style():
-            written.append(("--figure", args.figure, png(side_by_side(made.panels))))
+        with style.own_style():
+            written.append(("--figure", args.figure, style.png(fits.side_by_side(made.panels))))
     write_new_files(written, f": {counted(len(made.table), 'setting')}")
     return 0
 

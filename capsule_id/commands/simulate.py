@@ -308,15 +308,14 @@ def _write(
 def _draw(path: Path, t: "Trajectory", section: np.ndarray, G: float) -> None:
     """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
     from capsule_id.records.view import MotionView
-    from capsule_id.report.figures.fits import overview
-    from capsule_id.report.figures.style import new_figure, own_style, png
+    from capsule_id.report.figures import fits, style
 
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)
     channels = {"x_capsule": np.asarray(t.X2), "x_rel": x_rel}
     view = MotionView(np.asarray(t.times), channels, x_rel, rate, x_rel[section], rate[section], G)
-    with own_style():
-        overview(view, figure := new_figure(10.0, 4.8))
-        replace_file(path, png(figure))
+    with style.own_style():
+        fits.overview(view, figure := style.new_figure(10.0, 4.8))
+        replace_file(path, style.png(figure))
 
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:

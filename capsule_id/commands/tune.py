@@ -64,8 +64,7 @@ def run(args: argparse.Namespace) -> int:
     draws = whole_number("draws", args.draws, 1)
     prepare_jax(not args.no_cache)
     from capsule_id.api import load
-    from capsule_id.report.figures.style import mark, own_style, png
-    from capsule_id.report.figures.sweeps import tuned
+    from capsule_id.report.figures import style, sweeps
 
     result = load(args.result)
     if result.trust != "trusted":
@@ -86,11 +85,9 @@ def run(args: argparse.Namespace) -> int:
     ]
     if args.figure is not None:
         trust = str(found.table["trust"].iloc[0])
-        with own_style():
-            figure = tuned(found.surface, found.best, found.points, f"{result.rig.name}, {trust}:")
-            if result.rig.synthetic:
-                mark(figure, "synthetic data")
-            written.append(("--figure", args.figure, png(figure)))
+        with style.own_style():
+            figure = sweeps.tuned(found.surface, found.best, found.points, f"{result.rig.name}, {trust}:")
+            written.append(("--figure", args.figure, style.png(figure, result.rig.synthetic)))
     say(_summary(found))
     write_new_files(written)
     return 0 if result.clean else 3
