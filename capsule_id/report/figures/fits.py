@@ -74,15 +74,8 @@ def comparison(item: Comparison, ax: Axes) -> None:
 
 
 def residuals(item: Comparison, ax: Axes) -> None:
-    """Residuals at the point fit in units of the noise sd, with the band that holds 95 % of a good fit's.
-
-    Raises
-    ------
-    ValueError
-        If the comparison has no residuals.
-    """
-    if item.residuals is None:
-        raise ValueError(f"{item.label} has no residuals")
+    """Residuals at the point fit in units of the noise sd, with the band that holds 95 % of a good fit's."""
+    assert item.residuals is not None
     many = item.residuals.size > _MANY
     _about_zero(ax, QUANTILE_975, 1.1 * max(3.0, _largest(item.residuals)))
     ax.plot(item.points[0].x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
@@ -90,15 +83,9 @@ def residuals(item: Comparison, ax: Axes) -> None:
 
 
 def autocorrelation(item: Comparison, ax: Axes) -> None:
-    """Autocorrelation of the residuals from lag 1, with the 95 % band of a white record.
-
-    Raises
-    ------
-    ValueError
-        If the comparison has no autocorrelation.
-    """
-    if item.autocorrelation is None or item.residuals is None:
-        raise ValueError(f"{item.label} has no autocorrelation")
+    """Autocorrelation of the residuals from lag 1, with the 95 % band of a white record."""
+    assert item.autocorrelation is not None
+    assert item.residuals is not None
     bound = QUANTILE_975 / float(np.sqrt(item.residuals.size))
     limit = 1.25 * max(_largest(item.autocorrelation), 2.0 * bound, 0.05)
     _about_zero(ax, bound, limit, "95 % of white records")
@@ -403,16 +390,9 @@ def phase_plane(view: MotionView, ax: Axes) -> None:
 
 
 def force_on_rod(record: RunRecord, ax: Axes) -> None:
-    """K times the recorded current against time, and beside it the fitted drive.
-
-    Raises
-    ------
-    ValueError
-        If the view has no force: it was made without K, or from a table without current.
-    """
+    """K times the recorded current against time, and beside it the fitted drive."""
     view = record.view
-    if view.force is None:
-        raise ValueError("this view has no force: give view_record a K and a table with current")
+    assert view.force is not None, "view_record had a K and a table with current"
     ax.plot(view.time, view.force, color=PURPLE, lw=1.0, label="K times current")
     ax.plot(view.time, record.force, color=BLACK, ls="--", lw=1.2, label="model")
     set_text(ax, "time, s", "force on the rod, N", f"motion: {view.label}")
