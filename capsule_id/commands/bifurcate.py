@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.simulate import (
@@ -262,11 +263,10 @@ def _dataset(
 ) -> "xr.Dataset":
     """The Dataset for the options."""
     from capsule_id.motions import sweep
-    from capsule_id.motions.response import Settling
     from capsule_id.physics.drives import capsule_and_drive
     from capsule_id.report.write import read_draws
 
-    settling = Settling(
+    settling = cid.Settling(
         dropped=whole_number("dropped", args.dropped),
         observed=whole_number("observed", args.observed),
         merge_contacts=number("merge-contacts", args.merge_contacts),

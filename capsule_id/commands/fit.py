@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET, rig_folders
 from capsule_id.commands.bifurcate import client_of
 from capsule_id.commands.compilation import prepare_jax
@@ -36,8 +37,6 @@ from capsule_id.views import counted
 
 if TYPE_CHECKING:
     from distributed import Client
-
-    from capsule_id.api import Fit
 
 # rigs: Fits of one rig or of several: result directory, table, verdict; one after the other, or on a Dask cluster.
 #
@@ -85,14 +84,12 @@ def make_fit(
     kinds: Registry,
     store: Path | None = None,
     progress: OnProgress | None = None,
-    preliminary: Callable[["Fit"], None] | None = None,
-) -> "Fit":
+    preliminary: Callable[["cid.Fit"], None] | None = None,
+) -> "cid.Fit":
     """The fit that the options ask for; ``store``, ``progress`` and ``preliminary`` as in ``capsule_id.fit``."""
-    from capsule_id.api import fit
-
     words = options.seed, options.experiments, options.budget, store, progress, kinds
     profile = [name.strip() for name in (options.profile or "").split(",") if name.strip()]
-    result = fit(rig, *words, ess=options.ess, preliminary=preliminary, profile=profile)
+    result = cid.fit(rig, *words, ess=options.ess, preliminary=preliminary, profile=profile)
     made = result.provenance.made[0], options.command
     return replace(result, provenance=replace(result.provenance, made=made))
 
@@ -115,7 +112,7 @@ def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, prog
     with work_in_progress(directory, fingerprint_of(rig, options, kinds), options.resume) as unfinished:
         saved.set()
 
-        def show_point(first: "Fit") -> None:
+        def show_point(first: "cid.Fit") -> None:
             write_file(unfinished / "report.html", html.render(first, ()))
             progress.note(
                 f"point fit, before the sample; report: {unfinished / 'report.html'}\n{first.parameter_table}"
@@ -331,9 +328,7 @@ def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> 
         names = ", ".join(ignored).replace("_", "-")
         raise InputError("--compare prints tables, writes nothing and fits all experiments", names, f"remove {names}")
     prepare_jax(not args.no_cache)
-    from capsule_id.inference.compare import compare_models, compare_points
-
-    compare = compare_points if args.no_sample else compare_models
+    compare = cid.compare_points if args.no_sample else cid.compare_models
     with Progress(not args.quiet, "step") as progress:
         choice = compare(rigs[0], args.compare.split(","), kinds, args.seed, progress)
     say(choice.text)

@@ -5,10 +5,11 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, Option
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import complain, refusing_damage, say
@@ -16,10 +17,6 @@ from capsule_id.errors import InputError, refusing
 from capsule_id.output import replace_file
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, by_index
 from capsule_id.views import counted
-
-if TYPE_CHECKING:
-    from capsule_id.physics.model import Trajectory
-
 
 # options: Parameters of the capsule and its drive as options, and their values from a result.
 
@@ -236,9 +233,6 @@ def run(args: argparse.Namespace) -> int:
     prepare_jax(not args.no_cache)
     from capsule_id.physics.drives import capsule_and_drive
     from capsule_id.physics.forces import warn_of_far_gap
-    from capsule_id.physics.model import Status, status_message
-    from capsule_id.physics.simulation import simulate
-    from capsule_id.physics.smooth.engine import Smoothing
 
     p, e = capsule_and_drive(values, args.drive)
     grid = np.linspace(0.0, end, samples)
@@ -247,13 +241,13 @@ def run(args: argparse.Namespace) -> int:
     # Impacts are short: the figure needs more samples than the table.
     drawn = np.linspace(0.0, end, PICTURE_SAMPLES) if args.figure is not None else section
     times = np.union1d(np.union1d(grid, section), drawn)
-    smoothing = Smoothing(**widths) if args.model == "smooth" else None
-    t = simulate(p, e, times, (X1, Y1, X2, Y2), model=args.model, semantics=args.semantics, smoothing=smoothing)
-    status = Status(int(t.status))
+    smoothing = cid.Smoothing(**widths) if args.model == "smooth" else None
+    t = cid.simulate(p, e, times, (X1, Y1, X2, Y2), model=args.model, semantics=args.semantics, smoothing=smoothing)
+    status = cid.Status(int(t.status))
     if not status.usable:
-        raise InputError("the run must be complete", status.name, status_message(t.status))
-    if status is not Status.OK:
-        complain(f"capsule-id simulate: {status_message(t.status)}")
+        raise InputError("the run must be complete", status.name, cid.status_message(t.status))
+    if status is not cid.Status.OK:
+        complain(f"capsule-id simulate: {cid.status_message(t.status)}")
     warn_of_far_gap(p.G, t.x_rel)
     held = np.isin(times, grid)
     columns = {name: np.asarray(getattr(t, name))[held] for name in COLUMNS}
@@ -305,7 +299,7 @@ def _write(
     replace_file(path, netcdf_bytes(xr.Dataset(data, {"time": ("time", time, {"units": "s"})}, dict(provenance))))
 
 
-def _draw(path: Path, t: "Trajectory", section: np.ndarray, G: float) -> None:
+def _draw(path: Path, t: "cid.Trajectory", section: np.ndarray, G: float) -> None:
     """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
     from capsule_id.records.view import MotionView
     from capsule_id.report.figures import fits, style

@@ -4,6 +4,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET
 from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.predict import check_new_files, write_new_files
@@ -63,10 +64,9 @@ def run(args: argparse.Namespace) -> int:
     faster_than = None if args.faster_than is None else number("faster-than", args.faster_than)
     draws = whole_number("draws", args.draws, 1)
     prepare_jax(not args.no_cache)
-    from capsule_id.api import load
     from capsule_id.report.figures import style, sweeps
 
-    result = load(args.result)
+    result = cid.load(args.result)
     if result.trust != "trusted":
         failed = [
             f"fail {finding.code}: {result.text(finding)}" for finding in result.findings if finding.level == "fail"

@@ -79,7 +79,7 @@ class Drive(Protocol):
 
     def rate(self, piece: Piece, t: jax.Array) -> Any:
         """(L,) or () 1/s, how fast the force changes from t (L,) on: it bounds the first guess of a step."""
-        return 0.0
+        return self.frequency()
 
     def piece(self, t: jax.Array) -> Piece:
         """What holds on the piece at the time t (L,); every entry (L,). The last one is the time at which it ends, s,
@@ -173,10 +173,6 @@ class Excitation(Drive):
         return self.P_d * self.cosine(t)
 
     def frequency(self) -> Any:
-        """Magnitude of Omega, rad/s."""
-        return jnp.abs(self.Omega)
-
-    def rate(self, piece: Piece, t: jax.Array) -> Any:
         """Magnitude of Omega, rad/s."""
         return jnp.abs(self.Omega)
 

@@ -74,8 +74,15 @@ def comparison(item: Comparison, ax: Axes) -> None:
 
 
 def residuals(item: Comparison, ax: Axes) -> None:
-    """Residuals at the point fit in units of the noise sd, with the band that holds 95 % of a good fit's."""
-    assert item.residuals is not None
+    """Residuals at the point fit in units of the noise sd, with the band that holds 95 % of a good fit's.
+
+    Raises
+    ------
+    ValueError
+        If the comparison has no residuals.
+    """
+    if item.residuals is None:
+        raise ValueError(f"{item.label} has no residuals")
     many = item.residuals.size > _MANY
     _about_zero(ax, QUANTILE_975, 1.1 * max(3.0, _largest(item.residuals)))
     ax.plot(item.points[0].x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
@@ -83,9 +90,15 @@ def residuals(item: Comparison, ax: Axes) -> None:
 
 
 def autocorrelation(item: Comparison, ax: Axes) -> None:
-    """Autocorrelation of the residuals from lag 1, with the 95 % band of a white record."""
-    assert item.autocorrelation is not None
-    assert item.residuals is not None
+    """Autocorrelation of the residuals from lag 1, with the 95 % band of a white record.
+
+    Raises
+    ------
+    ValueError
+        If the comparison has no autocorrelation.
+    """
+    if item.autocorrelation is None or item.residuals is None:
+        raise ValueError(f"{item.label} has no autocorrelation")
     bound = QUANTILE_975 / float(np.sqrt(item.residuals.size))
     limit = 1.25 * max(_largest(item.autocorrelation), 2.0 * bound, 0.05)
     _about_zero(ax, bound, limit, "95 % of white records")
