@@ -13,7 +13,7 @@ from typing import Any, NoReturn, TextIO
 
 from capsule_id import console
 from capsule_id.commands import add_options
-from capsule_id.commands.compilation import leave_cache, use_one_blas_thread
+from capsule_id.commands.compilation import leave_cache, prepare_jax, use_one_blas_thread
 from capsule_id.console import INTERRUPTED, end_interrupted, interruptible
 from capsule_id.errors import InputError, OutputError
 
@@ -162,6 +162,8 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         with warnings.catch_warnings(), interruptible(interrupted):
             args = make_parser(program).parse_args(arguments)
             warnings.showwarning = partial(_show_warning, program)
+            if "no_cache" in args:  # a command that computes with JAX, which nothing has imported yet
+                prepare_jax(not args.no_cache)
             return args.run(args)
     except OutputError:
         raise

@@ -14,7 +14,6 @@ import numpy as np
 
 import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.simulate import (
     DEFAULTS,
     capsule_options,
@@ -218,7 +217,6 @@ def run(args: argparse.Namespace) -> int:
     default = Path(f"bifurcation-{names}.nc") if rig is None else Path("results") / f"{rig.name}-{names}.nc"
     out = default if args.out is None else args.out
     store = prepare_store(out, args.resume)
-    prepare_jax(not args.no_cache)
     from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.report.figures.style import own_style, png
     from capsule_id.report.write import netcdf_bytes

@@ -103,7 +103,6 @@ def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, prog
         If the input is bad; then nothing is written.
     """
     check_output(directory, options)
-    prepare_jax(not options.no_cache)
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.report import html, write
 
@@ -170,7 +169,6 @@ def fit_many(
         )
     for rig in rigs:
         check_output(root / rig.name, options)
-    prepare_jax(not options.no_cache)
     from capsule_id.report.write import replace_result
 
     messages_of(kinds)
@@ -327,7 +325,6 @@ def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> 
     if ignored:
         names = ", ".join(ignored).replace("_", "-")
         raise InputError("--compare prints tables, writes nothing and fits all experiments", names, f"remove {names}")
-    prepare_jax(not args.no_cache)
     compare = cid.compare_points if args.no_sample else cid.compare_models
     with Progress(not args.quiet, "step") as progress:
         choice = compare(rigs[0], args.compare.split(","), kinds, args.seed, progress)

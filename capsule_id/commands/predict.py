@@ -6,7 +6,6 @@ from pathlib import Path
 
 import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import say
 from capsule_id.errors import InputError, check_seed, refusing
 from capsule_id.output import replace_file
@@ -34,7 +33,6 @@ def run(args: argparse.Namespace) -> int:
     """
     check_seed(args.seed)
     check_new_files(args)
-    prepare_jax(not args.no_cache)
     from capsule_id.inference.prediction import predict
     from capsule_id.report.figures import fits, style
 

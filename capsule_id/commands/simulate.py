@@ -11,7 +11,6 @@ import numpy as np
 
 import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, Option
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import complain, refusing_damage, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.output import replace_file
@@ -230,7 +229,6 @@ def run(args: argparse.Namespace) -> int:
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
-    prepare_jax(not args.no_cache)
     from capsule_id.physics.drives import capsule_and_drive
     from capsule_id.physics.forces import warn_of_far_gap
 

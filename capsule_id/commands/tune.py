@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.predict import check_new_files, write_new_files
 from capsule_id.commands.simulate import number, whole_number
 from capsule_id.console import Progress, say
@@ -63,7 +62,6 @@ def run(args: argparse.Namespace) -> int:
             given[name] = values[0]
     faster_than = None if args.faster_than is None else number("faster-than", args.faster_than)
     draws = whole_number("draws", args.draws, 1)
-    prepare_jax(not args.no_cache)
     from capsule_id.report.figures import style, sweeps
 
     result = cid.load(args.result)
