@@ -37,7 +37,7 @@ from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
 from capsule_id.inference.tuning import Tuning, tune
-from capsule_id.output import check_directory, publish, replace_file, work_in_progress
+from capsule_id.output import check_directory, replace_file
 from capsule_id.parameters import by_index, is_stated, symbol_of
 from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
 from capsule_id.physics.model import CapsuleParameters, Drive, Trajectory
@@ -56,7 +56,7 @@ from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import subfigure_at
 from capsule_id.report.html import summary_html
 from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
-from capsule_id.report.write import data_tree, load_fields, model_json, result_files, table_frame, write_result
+from capsule_id.report.write import data_tree, load_fields, model_json, replace_result, result_files, table_frame
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding, Level, ResultTable, Trust, after_number
@@ -348,11 +348,8 @@ class Fit(Result):
         InputError
             If it exists and is not a result of this package.
         """
-        path = Path(directory)
-        check_directory(path)
-        with work_in_progress(path, {}, resume=False) as partial:
-            write_result(result_files(self), partial)
-            publish(partial, path)
+        check_directory(Path(directory))
+        replace_result(result_files(self), Path(directory), {})
 
 
 def compare(a: Result, b: Result) -> pd.DataFrame:

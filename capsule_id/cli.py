@@ -13,7 +13,7 @@ from typing import Any, NoReturn, TextIO
 
 from capsule_id import console
 from capsule_id.commands import add_options
-from capsule_id.commands.compilation import leave_cache, use_one_blas_thread
+from capsule_id.commands.compilation import leave_cache, prepare_jax, use_one_blas_thread
 from capsule_id.console import INTERRUPTED, end_interrupted, interruptible
 from capsule_id.errors import InputError, OutputError
 
@@ -41,9 +41,9 @@ def capsule_id(arguments: Sequence[str] | None = None) -> int:
     return _run("capsule-id", _capsule_parser, arguments)
 
 
-def _parser(program: str, text: str) -> _Parser:
+def _parser(program: str, text: str, example: str) -> _Parser:
     """A parser with ``--version``. It takes no abbreviated options: a new option must not change an old command."""
-    parser = _Parser(prog=program, description=text, allow_abbrev=False)
+    parser = _Parser(prog=program, description=text, epilog=example, allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"{program} {version('capsule-id')}")
     return parser
 
@@ -55,8 +55,7 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
         "Fit the vibro-impact capsule to a folder of rig measurements. Prints value, sd and trust of every parameter, and "
         "writes report.html. capsule-id init makes such a folder, capsule-id check examines it. Exit code 3: a check failed."
     )
-    parser = _parser(program, text)
-    parser.epilog = "example: %(prog)s my-rig --seed 1"
+    parser = _parser(program, text, "example: %(prog)s my-rig --seed 1")
     add_options(parser, fit.OPTIONS)
     parser.set_defaults(run=fit.run, program=program)
     return parser
@@ -122,13 +121,13 @@ def _commands() -> tuple[tuple[str, Any, str, str], ...]:
 
 
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
-    parser = _parser(program, "Make, check, fit, simulate and report.")
-    parser.epilog = "example: %(prog)s check my-rig; each COMMAND has its own --help"
+    example = "example: %(prog)s check my-rig; each COMMAND has its own --help"
+    parser = _parser(program, "Make, check, fit, simulate and report.", example)
     parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)
     commands = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
     for name, module, text, example in _commands():
-        sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
-        sub.epilog = f"example: %(prog)s {example}"
+        example = f"example: %(prog)s {example}"
+        sub = commands.add_parser(name, help=text, description=text, epilog=example, allow_abbrev=False)
         add_options(sub, module.OPTIONS)
         sub.set_defaults(run=module.run, program=sub.prog)
     return parser
@@ -162,6 +161,8 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         with warnings.catch_warnings(), interruptible(interrupted):
             args = make_parser(program).parse_args(arguments)
             warnings.showwarning = partial(_show_warning, program)
+            if "no_cache" in args:  # a command that computes with JAX, which nothing has imported yet
+                prepare_jax(not args.no_cache)
             return args.run(args)
     except OutputError:
         raise

@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import chdir, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from types import FrameType, MappingProxyType
+from types import MappingProxyType
 from typing import Any
 
 from capsule_id.errors import InputError, OutputError, printable
@@ -95,7 +95,7 @@ def interruptible(message: str) -> Iterator[None]:
     watchdog.start()
     wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
     for number in before:
-        signal.signal(number, _set_flag)
+        signal.signal(number, lambda *_: _flag.set())
     try:
         yield
     finally:
@@ -125,11 +125,6 @@ def end_interrupted(code: int) -> None:
         with suppress(OSError, ValueError):
             stream.flush()
     os._exit(code)
-
-
-def _set_flag(number: int, frame: FrameType | None) -> None:
-    del number, frame
-    _flag.set()
 
 
 def _watch(receiver: socket.socket, ended: threading.Event, message: str) -> None:
@@ -361,9 +356,7 @@ def _clock(seconds: float) -> str:
 
 def _compiling() -> str:
     """Words for a point fit that compiles its programs, "" where a cache holds programs of an earlier one."""
-    directory = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    if not directory:
-        return ", compiling"
-    with suppress(OSError):
-        return "" if any(Path(directory).iterdir()) else ", compiling (once per machine)"
+    with suppress(OSError, KeyError):
+        cache = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+        return "" if any(cache.iterdir()) else ", compiling (once per machine)"
     return ", compiling"

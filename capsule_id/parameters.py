@@ -305,10 +305,9 @@ DRIVES: Mapping[str, tuple[str, ...]] = {
     "pulses": ("P_on", "period", "duty", "P_off", "phase", "lag", "reaction"),
 }
 
-#: The leaves of the model: fields of ``CapsuleParameters``, fields of the drives, and both.
+#: The leaves of the model: fields of ``CapsuleParameters``, and those with the fields of the drives.
 CAPSULE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "capsule"}
-DRIVE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "drive"}
-LEAVES: Mapping[str, Parameter] = {**CAPSULE_LEAVES, **DRIVE_LEAVES}
+LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf is not None}
 #: Quantities of a sweep: every leaf, and the frequency of the drive in Hz, also in the place of the period of pulses (a
 #: diagram's ``period`` is that of the motion).
 SWEPT: Mapping[str, Parameter] = {

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.simulate import (
     DEFAULTS,
     capsule_options,
@@ -217,7 +217,6 @@ def run(args: argparse.Namespace) -> int:
     default = Path(f"bifurcation-{names}.nc") if rig is None else Path("results") / f"{rig.name}-{names}.nc"
     out = default if args.out is None else args.out
     store = prepare_store(out, args.resume)
-    prepare_jax(not args.no_cache)
     from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.report.figures.style import own_style, png
     from capsule_id.report.write import netcdf_bytes
@@ -234,7 +233,7 @@ def run(args: argparse.Namespace) -> int:
             measured, sentence = overlay(rig, axes[0].name, axes[0].values, values, fitted, by_name)
             complain(sentence)
         with own_style():
-            figure = png(draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+            figure = png(draw(data, axes, measured), synthetic=rig is not None and rig.synthetic)
         with refusing("the output must be writable", "choose another --out", out):
             out.parent.mkdir(parents=True, exist_ok=True)
             replace_files({out: netcdf_bytes(data), out.with_suffix(".png"): figure})
@@ -244,24 +243,17 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def draw(
-    data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredPoint]" = (), synthetic: bool = False
-) -> "Figure":
+def draw(data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredPoint]" = ()) -> "Figure":
     """The figure of a computed Dataset. A diagram also shows measured runs, each with its own label."""
     from capsule_id.report.figures import sweeps
-    from capsule_id.report.figures.style import mark
 
     drawn = sweeps.in_units(data, {axis.name: (axis.unit, axis.factor) for axis in axes})
     title = str(data.attrs["rig"])
     if "probability" in data:
-        figure = sweeps.bands(drawn, title)
-    elif len(axes) == 2:
-        figure = sweeps.motion_map(drawn, title)
-    else:
-        figure = sweeps.bifurcation(drawn, measured, title)
-    if synthetic:
-        mark(figure, "synthetic data")
-    return figure
+        return sweeps.bands(drawn, title)
+    if len(axes) == 2:
+        return sweeps.motion_map(drawn, title)
+    return sweeps.bifurcation(drawn, measured, title)
 
 
 def _dataset(
@@ -269,11 +261,10 @@ def _dataset(
 ) -> "xr.Dataset":
     """The Dataset for the options."""
     from capsule_id.motions import sweep
-    from capsule_id.motions.response import Settling
     from capsule_id.physics.drives import capsule_and_drive
     from capsule_id.report.write import read_draws
 
-    settling = Settling(
+    settling = cid.Settling(
         dropped=whole_number("dropped", args.dropped),
         observed=whole_number("observed", args.observed),
         merge_contacts=number("merge-contacts", args.merge_contacts),

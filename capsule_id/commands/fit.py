@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET, rig_folders
 from capsule_id.commands.bifurcate import client_of
 from capsule_id.commands.compilation import prepare_jax
@@ -29,14 +30,13 @@ from capsule_id.console import (
 from capsule_id.errors import InputError, check_seed
 from capsule_id.experiments.kind import CHOICES, Registry, default_registry, make_experiments
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress, write_file
+from capsule_id.report.messages import messages_of
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
     from distributed import Client
-
-    from capsule_id.api import Fit
 
 # rigs: Fits of one rig or of several: result directory, table, verdict; one after the other, or on a Dask cluster.
 #
@@ -84,14 +84,12 @@ def make_fit(
     kinds: Registry,
     store: Path | None = None,
     progress: OnProgress | None = None,
-    preliminary: Callable[["Fit"], None] | None = None,
-) -> "Fit":
+    preliminary: Callable[["cid.Fit"], None] | None = None,
+) -> "cid.Fit":
     """The fit that the options ask for; ``store``, ``progress`` and ``preliminary`` as in ``capsule_id.fit``."""
-    from capsule_id.api import fit
-
     words = options.seed, options.experiments, options.budget, store, progress, kinds
     profile = [name.strip() for name in (options.profile or "").split(",") if name.strip()]
-    result = fit(rig, *words, ess=options.ess, preliminary=preliminary, profile=profile)
+    result = cid.fit(rig, *words, ess=options.ess, preliminary=preliminary, profile=profile)
     made = result.provenance.made[0], options.command
     return replace(result, provenance=replace(result.provenance, made=made))
 
@@ -105,19 +103,16 @@ def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, prog
         If the input is bad; then nothing is written.
     """
     check_output(directory, options)
-    prepare_jax(not options.no_cache)
     # JAX loads only now, so that a faulty folder is reported at once.
-    from capsule_id.report.html import render
-    from capsule_id.report.messages import messages_of
-    from capsule_id.report.write import result_files, write_result
+    from capsule_id.report import html, write
 
     make_experiments(rig, options.experiments, kinds)
     messages_of(kinds)  # refuses conflicting messages before the fit
     with work_in_progress(directory, fingerprint_of(rig, options, kinds), options.resume) as unfinished:
         saved.set()
 
-        def show_point(first: "Fit") -> None:
-            write_file(unfinished / "report.html", render(first, ()))
+        def show_point(first: "cid.Fit") -> None:
+            write_file(unfinished / "report.html", html.render(first, ()))
             progress.note(
                 f"point fit, before the sample; report: {unfinished / 'report.html'}\n{first.parameter_table}"
             )
@@ -125,7 +120,7 @@ def fit_one(rig: Rig, options: Namespace, directory: Path, kinds: Registry, prog
         # A fit of bench tests ends as soon.
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
         result = make_fit(rig, options, kinds, unfinished / CHAINS, progress, preliminary)
-        write_result(result_files(result), unfinished)
+        write.write_result(write.result_files(result), unfinished)
         publish(unfinished, directory)
     saved.clear()
     report = directory / "report.html"
@@ -174,8 +169,7 @@ def fit_many(
         )
     for rig in rigs:
         check_output(root / rig.name, options)
-    prepare_jax(not options.no_cache)
-    from capsule_id.report.messages import messages_of
+    from capsule_id.report.write import replace_result
 
     messages_of(kinds)
     for rig in rigs:
@@ -190,7 +184,7 @@ def fit_many(
             try:
                 files, line, clean = fitted()
                 stop_if_interrupted()
-                _write(files, root / rig.name, fingerprint_of(rig, options, kinds))
+                replace_result(files, root / rig.name, fingerprint_of(rig, options, kinds))
             except Exception as error:  # the other rigs are fitted all the same
                 stop_if_interrupted()
                 traceback = "" if isinstance(error, InputError | OSError) else f"; {save_traceback(error)}"
@@ -215,16 +209,15 @@ def fitted_rig(rig: Rig, options: Namespace, root: Path, kinds: Registry | None 
         If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
     """
     prepare_jax(not options.no_cache)
-    from capsule_id.report.columns import wrapped
-    from capsule_id.report.write import result_files
+    from capsule_id.report import columns, write
 
     try:
         result = make_fit(rig, options, kinds or default_registry(), None, lambda *_: None)
     except KeyboardInterrupt:
         raise RuntimeError("interrupted") from None
-    changes = "".join(f"\n{line}" for line in wrapped(result.remarks))
+    changes = "".join(f"\n{line}" for line in columns.wrapped(result.remarks))
     line = f"{rig.name}: {result.verdict}; report: {root / rig.name / 'report.html'}{changes}"
-    return result_files(result), line, result.clean
+    return write.result_files(result), line, result.clean
 
 
 def _on_cluster(
@@ -238,14 +231,6 @@ def _on_cluster(
         for task in [task for task in tasks if task.done()]:
             yield tasks.pop(task), task.result
         time.sleep(POLL)
-
-
-def _write(files: Mapping[str, bytes], directory: Path, fingerprint: Mapping[str, object]) -> None:
-    from capsule_id.report.write import write_result
-
-    with work_in_progress(directory, fingerprint, resume=False) as unfinished:
-        write_result(files, unfinished)
-        publish(unfinished, directory)
 
 
 DEFAULT_MAX_STEPS, DEFAULT_ESS = 2500, 1000
@@ -340,10 +325,7 @@ def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> 
     if ignored:
         names = ", ".join(ignored).replace("_", "-")
         raise InputError("--compare prints tables, writes nothing and fits all experiments", names, f"remove {names}")
-    prepare_jax(not args.no_cache)
-    from capsule_id.inference.compare import compare_models, compare_points
-
-    compare = compare_points if args.no_sample else compare_models
+    compare = cid.compare_points if args.no_sample else cid.compare_models
     with Progress(not args.quiet, "step") as progress:
         choice = compare(rigs[0], args.compare.split(","), kinds, args.seed, progress)
     say(choice.text)

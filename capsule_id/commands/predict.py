@@ -4,8 +4,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import say
 from capsule_id.errors import InputError, check_seed, refusing
 from capsule_id.output import replace_file
@@ -33,18 +33,15 @@ def run(args: argparse.Namespace) -> int:
     """
     check_seed(args.seed)
     check_new_files(args)
-    prepare_jax(not args.no_cache)
-    from capsule_id.api import load
     from capsule_id.inference.prediction import predict
-    from capsule_id.report.figures.fits import side_by_side
-    from capsule_id.report.figures.style import own_style, png
+    from capsule_id.report.figures import fits, style
 
-    made = predict(load(args.result), args.settings, seed=args.seed)
+    made = predict(cid.load(args.result), args.settings, seed=args.seed)
     table = made.table.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode()
     written = [("--out", args.out, table)]
     if args.figure is not None:
-        with own_style():
-            written.append(("--figure", args.figure, png(side_by_side(made.panels))))
+        with style.own_style():
+            written.append(("--figure", args.figure, style.png(fits.side_by_side(made.panels))))
     write_new_files(written, f": {counted(len(made.table), 'setting')}")
     return 0
 

@@ -5,21 +5,17 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, Option
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import complain, refusing_damage, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.output import replace_file
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, by_index
 from capsule_id.views import counted
-
-if TYPE_CHECKING:
-    from capsule_id.physics.model import Trajectory
-
 
 # options: Parameters of the capsule and its drive as options, and their values from a result.
 
@@ -233,12 +229,8 @@ def run(args: argparse.Namespace) -> int:
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
-    prepare_jax(not args.no_cache)
     from capsule_id.physics.drives import capsule_and_drive
     from capsule_id.physics.forces import warn_of_far_gap
-    from capsule_id.physics.model import Status, status_message
-    from capsule_id.physics.simulation import simulate
-    from capsule_id.physics.smooth.engine import Smoothing
 
     p, e = capsule_and_drive(values, args.drive)
     grid = np.linspace(0.0, end, samples)
@@ -247,13 +239,13 @@ def run(args: argparse.Namespace) -> int:
     # Impacts are short: the figure needs more samples than the table.
     drawn = np.linspace(0.0, end, PICTURE_SAMPLES) if args.figure is not None else section
     times = np.union1d(np.union1d(grid, section), drawn)
-    smoothing = Smoothing(**widths) if args.model == "smooth" else None
-    t = simulate(p, e, times, (X1, Y1, X2, Y2), model=args.model, semantics=args.semantics, smoothing=smoothing)
-    status = Status(int(t.status))
+    smoothing = cid.Smoothing(**widths) if args.model == "smooth" else None
+    t = cid.simulate(p, e, times, (X1, Y1, X2, Y2), model=args.model, semantics=args.semantics, smoothing=smoothing)
+    status = cid.Status(int(t.status))
     if not status.usable:
-        raise InputError("the run must be complete", status.name, status_message(t.status))
-    if status is not Status.OK:
-        complain(f"capsule-id simulate: {status_message(t.status)}")
+        raise InputError("the run must be complete", status.name, cid.status_message(t.status))
+    if status is not cid.Status.OK:
+        complain(f"capsule-id simulate: {cid.status_message(t.status)}")
     warn_of_far_gap(p.G, t.x_rel)
     held = np.isin(times, grid)
     columns = {name: np.asarray(getattr(t, name))[held] for name in COLUMNS}
@@ -305,18 +297,17 @@ def _write(
     replace_file(path, netcdf_bytes(xr.Dataset(data, {"time": ("time", time, {"units": "s"})}, dict(provenance))))
 
 
-def _draw(path: Path, t: "Trajectory", section: np.ndarray, G: float) -> None:
+def _draw(path: Path, t: "cid.Trajectory", section: np.ndarray, G: float) -> None:
     """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
     from capsule_id.records.view import MotionView
-    from capsule_id.report.figures.fits import overview
-    from capsule_id.report.figures.style import new_figure, own_style, png
+    from capsule_id.report.figures import fits, style
 
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)
     channels = {"x_capsule": np.asarray(t.X2), "x_rel": x_rel}
     view = MotionView(np.asarray(t.times), channels, x_rel, rate, x_rel[section], rate[section], G)
-    with own_style():
-        overview(view, figure := new_figure(10.0, 4.8))
-        replace_file(path, png(figure))
+    with style.own_style():
+        fits.overview(view, figure := style.new_figure(10.0, 4.8))
+        replace_file(path, style.png(figure))
 
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:

@@ -4,8 +4,8 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
+import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET
-from capsule_id.commands.compilation import prepare_jax
 from capsule_id.commands.predict import check_new_files, write_new_files
 from capsule_id.commands.simulate import number, whole_number
 from capsule_id.console import Progress, say
@@ -62,12 +62,9 @@ def run(args: argparse.Namespace) -> int:
             given[name] = values[0]
     faster_than = None if args.faster_than is None else number("faster-than", args.faster_than)
     draws = whole_number("draws", args.draws, 1)
-    prepare_jax(not args.no_cache)
-    from capsule_id.api import load
-    from capsule_id.report.figures.style import mark, own_style, png
-    from capsule_id.report.figures.sweeps import tuned
+    from capsule_id.report.figures import style, sweeps
 
-    result = load(args.result)
+    result = cid.load(args.result)
     if result.trust != "trusted":
         failed = [
             f"fail {finding.code}: {result.text(finding)}" for finding in result.findings if finding.level == "fail"
@@ -86,11 +83,9 @@ def run(args: argparse.Namespace) -> int:
     ]
     if args.figure is not None:
         trust = str(found.table["trust"].iloc[0])
-        with own_style():
-            figure = tuned(found.surface, found.best, found.points, f"{result.rig.name}, {trust}:")
-            if result.rig.synthetic:
-                mark(figure, "synthetic data")
-            written.append(("--figure", args.figure, png(figure)))
+        with style.own_style():
+            figure = sweeps.tuned(found.surface, found.best, found.points, f"{result.rig.name}, {trust}:")
+            written.append(("--figure", args.figure, style.png(figure, result.rig.synthetic)))
     say(_summary(found))
     write_new_files(written)
     return 0 if result.clean else 3

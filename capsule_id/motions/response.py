@@ -406,7 +406,7 @@ def settle(
     section = T[:, None] * np.arange(settling.dropped - before, settling.dropped + settling.observed + 1)
     # The start comes first, which the section begins with where (almost) nothing is dropped.
     times = np.concatenate([np.zeros((len(T), 1)), section], axis=1) if settling.dropped > 1 else section
-    t = run_lanes(kernel(settling.max_steps), (p, e, law, initial), times, batched=True, width=width)
+    t = run_lanes(partial(kernel, settling.max_steps), (p, e, law, initial), times, batched=True, width=width)
     states = np.stack([np.asarray(x)[:, -section.shape[1] :] for x in (t.X1, t.Y1, t.X2, t.Y2)])
     seen = observe(p, e, law, section, states, settling.merge_contacts, settling.max_steps, width)
     states, closings, work = states[:, :, before:], seen[0][:, before:], seen[1][:, before:]

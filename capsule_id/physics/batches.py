@@ -176,10 +176,7 @@ def in_batches(
 
     A fixed number of rows needs one compilation only.
     """
-    padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % rows, axis=0)])
-    chunks = [padded[i : i + rows] for i in range(0, len(padded), rows)]
-    parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
-    return np.concatenate(parts)[: len(points)]
+    return np.asarray(run_lanes(function, (), points, batched=True, width=rows))
 
 
 @lru_cache(maxsize=1)

@@ -103,11 +103,9 @@ class FrictionLaw(Protocol):
 
     def forward(self, speed: Any) -> Any:
         """Resistance of a capsule that slides towards positive X2, N."""
-        ...
 
     def backward(self, speed: Any) -> Any:
         """Resistance of a capsule that slides towards negative X2, N."""
-        ...
 
 
 @jax.tree_util.register_dataclass
@@ -342,29 +340,19 @@ class Force:
 
     parameters: ClassVar[tuple[Parameter, ...]] = ()
 
-    @property
-    def gap(self) -> Any:
-        """m, infinite where it is never closed; None: no contact."""
-        return None
-
-    @property
-    def side(self) -> float:
-        """1.0: a contact pushes the capsule forward; -1.0: backward, behind a gap on the other side of the rod."""
-        return 1.0
-
-    @property
-    def present(self) -> Any:
-        """Whether there is something to meet: the closings of a contact that is not present do not count."""
-        return True
+    #: m, infinite where it is never closed; None: no contact.
+    gap: Any = None
+    #: 1.0: a contact pushes the capsule forward; -1.0: backward, behind a gap on the other side of the rod.
+    side: float = 1.0
+    #: Whether there is something to meet: the closings of a contact that is not present do not count.
+    present: Any = True
 
     def elastic(self, d: Any) -> Any:
         """The conservative part, N, at the stretch or penetration d, m."""
-        del d
         return 0.0
 
     def damping(self, d: Any, w: Any) -> Any:
         """The part that dissipates, N, at d, m, and its rate w, m/s; 0 at w = 0."""
-        del d, w
         return 0.0
 
     @property
@@ -399,24 +387,19 @@ class Force:
 class Spring(Force):
     """k d^power + c w: the rod's spring and damper, or a support behind the gap G; without stiffness no support.
 
-    k : N/m^power        c : N s/m, None: no damper        G : m, None: no contact        back : side -1
+    k : N/m^power        c : N s/m, None: no damper        G : m, None: no contact        side : -1.0 for a back spring
     """
 
     k: NumberOrBatch
     c: NumberOrBatch | None = None
     G: NumberOrBatch | None = None
     power: int = field(default=1, metadata={"static": True})
-    back: bool = field(default=False, metadata={"static": True})
+    side: float = field(default=1.0, metadata={"static": True})
 
     @property
     def gap(self) -> Any:
         """G."""
         return self.G
-
-    @property
-    def side(self) -> float:
-        """-1.0 for a back spring."""
-        return -1.0 if self.back else 1.0
 
     @property
     def present(self) -> Any:
@@ -429,7 +412,6 @@ class Spring(Force):
 
     def damping(self, d: Any, w: Any) -> Any:
         """c w."""
-        del d
         return 0.0 if self.c is None else (self.c * self.present) * w
 
 
@@ -441,7 +423,7 @@ def forces_of(p: Any) -> tuple[Force, ...]:
     if p.k2 is not None and p.G is not None:
         found.append(Spring(p.k2, p.c2, p.G))
     if p.k2_back is not None and p.G_back is not None:
-        found.append(Spring(p.k2_back, None, p.G_back, back=True))
+        found.append(Spring(p.k2_back, None, p.G_back, side=-1.0))
     return (*found, *(p.forces or ()))
 
 

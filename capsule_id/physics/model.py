@@ -64,7 +64,6 @@ class Drive(Protocol):
 
         piece : the force follows the analytic piece that holds at this time, s; default t itself
         """
-        ...
 
     def series(self, piece: Piece, t: jax.Array, h: Any, order: int) -> Series:
         """Coefficients 0 .. order - 1 of the force in N about t (L,) on a piece, in the scaled time s = (t' - t)/h."""
@@ -80,13 +79,11 @@ class Drive(Protocol):
 
     def rate(self, piece: Piece, t: jax.Array) -> Any:
         """(L,) or () 1/s, how fast the force changes from t (L,) on: it bounds the first guess of a step."""
-        del piece, t
-        return 0.0
+        return self.frequency()
 
     def piece(self, t: jax.Array) -> Piece:
         """What holds on the piece at the time t (L,); every entry (L,). The last one is the time at which it ends, s,
         differentiable, infinite for the last piece. Empty: there is one piece alone."""
-        del t
         return ()
 
     def following(self, piece: Piece) -> Piece:
@@ -100,12 +97,10 @@ class PeriodicDrive(Drive, Protocol):
     @property
     def period(self) -> Any:
         """s; () or (batch,)."""
-        ...
 
     @property
     def amplitude(self) -> Any:
         """The largest force, N; () or (batch,)."""
-        ...
 
 
 #: In place of a frequency that is not stated. The object is compared, so that NaN may be stated.
@@ -175,21 +170,14 @@ class Excitation(Drive):
 
     def force_at(self, t: Any, piece: Any = None) -> Any:
         """P_d cos(Omega t + phase), N."""
-        del piece
         return self.P_d * self.cosine(t)
 
     def frequency(self) -> Any:
         """Magnitude of Omega, rad/s."""
         return jnp.abs(self.Omega)
 
-    def rate(self, piece: Piece, t: jax.Array) -> Any:
-        """Magnitude of Omega, rad/s."""
-        del piece, t
-        return jnp.abs(self.Omega)
-
     def series(self, piece: Piece, t: jax.Array, h: Any, order: int) -> Series:
         """The coefficients follow from D'' = -Omega^2 D."""
-        del piece
         cosine, sine = cos_sin(self.Omega * t + self.phase)
         angle = jnp.asarray(self.Omega * h)
         turn = -(angle**2)

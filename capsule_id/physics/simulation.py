@@ -101,7 +101,7 @@ def simulate(
     forward mode in every float leaf, those of ``friction`` included; the smooth model in reverse mode too. Concrete
     batches are split into chunks of lanes that run on all cores; under a transformation the batch stays whole.
 
-    The engines, ``exact.kernel(max_steps)`` and ``smooth.kernel(smoothing, semantics, max_steps)``, return a function
+    The engines, ``partial(exact.kernel, max_steps)`` and ``smooth.kernel(smoothing, semantics, max_steps)``, return a function
     ``(p, e, law, initial, times) -> Trajectory`` of lanes: every leaf (L,), times (L, n), fields (L, n) and (L,),
     status and counters int32. Samples are NaN only in lanes whose status is not ``usable``. Bad values give a status,
     not an exception.
@@ -122,7 +122,7 @@ def simulate(
         initial = (*e.rod(grid[:, 0]), initial[2], initial[3])
     lanes = (p, e, law, initial)
     if model == "exact":
-        return run_lanes(exact.kernel(max_steps), lanes, grid, batched)
+        return run_lanes(partial(exact.kernel, max_steps), lanes, grid, batched)
     return run_lanes(smooth.kernel(smoothing, semantics, max_steps), lanes, grid, batched)
 
 

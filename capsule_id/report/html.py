@@ -35,7 +35,7 @@ from capsule_id.report.columns import (
     verdict_text,
 )
 from capsule_id.report.figures import fits as figures
-from capsule_id.report.figures.style import figure_of, mark, new_axes, new_figure, png, svg
+from capsule_id.report.figures.style import figure_of, new_axes, new_figure, png, svg
 from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, question_of, title_of
 from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, after_number, counted
 
@@ -95,10 +95,8 @@ def pictures(result: Result) -> tuple[Picture, ...]:
     drawn = []
     for name, section, title, caption, figure, alt, group in drawings(result):
         stop_if_interrupted()
-        if result.rig.synthetic:
-            mark(figure, "synthetic data")
         width, height = (round(96 * inches) for inches in figure.get_size_inches())
-        file = png(figure)
+        file = png(figure, result.rig.synthetic)
         drawn.append(Picture(name, section, title, caption, width, height, file, alt, group, svg(figure, len(file))))
     return tuple(drawn)
 

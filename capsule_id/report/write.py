@@ -26,7 +26,7 @@ from capsule_id.console import one_line, refusing_damage
 from capsule_id.errors import InputError, writing
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Pointwise, Posterior, Result
-from capsule_id.output import as_utf8, write_file
+from capsule_id.output import as_utf8, publish, work_in_progress, write_file
 from capsule_id.parameters import TABLE, Name
 from capsule_id.report.columns import columns_of, errors_left_out
 from capsule_id.report.figures.style import own_style
@@ -71,6 +71,13 @@ def write_result(files: Mapping[str, bytes], directory: Path) -> None:
     for name, content in files.items():
         write_file(directory / name, content, needed)
         needed -= len(content)
+
+
+def replace_result(files: Mapping[str, bytes], directory: Path, fingerprint: Mapping[str, object]) -> None:
+    """Write ``result_files`` into a new directory, which then takes the place of ``directory``; see ``work_in_progress``."""
+    with work_in_progress(directory, fingerprint, resume=False) as unfinished:
+        write_result(files, unfinished)
+        publish(unfinished, directory)
 
 
 def parameters_json(result: Result) -> dict[str, object]:

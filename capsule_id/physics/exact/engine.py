@@ -88,11 +88,6 @@ def first_samples(times: Float[jax.Array, "L n"], initial: Initial, valid: Bool[
     return values.at[:, :, 0].set(first), jnp.ones(len(times), jnp.int32)
 
 
-def row_of(state: CapsuleState, step: StepSeries) -> Float[jax.Array, "width L"]:
-    """(WIDTH, L): the step's polynomial."""
-    return jnp.stack([state.t, step.h, state.r, state.X2, *step.w, *step.v])
-
-
 def values_of(row: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """(X1, Y1, X2, Y2) at t from rows (WIDTH, ...)."""
     w, v = list(row[4 : 5 + DEGREE]), list(row[5 + DEGREE :])
@@ -167,8 +162,6 @@ SHORTEST_PIECE = 1e-15
 
 # Numbers of samples are padded to this times a power of four, of two inside of a transformation.
 SHORTEST = 64
-
-Kernel = Callable[[CapsuleParameters, Drive, FrictionLaw, Initial, jax.Array], Trajectory]
 
 
 class RunState(NamedTuple):
@@ -331,7 +324,8 @@ def march(
         lanes, rows, starts, row = carry
         after, step = take_step(constants, t_end, max_steps, lanes)
         begin = jnp.where(lanes.active, stop_gradient(lanes.state.t), jnp.inf)
-        rows = jax.lax.dynamic_update_index_in_dim(rows, row_of(lanes.state, step), row, 0)
+        polynomial = jnp.stack([lanes.state.t, step.h, lanes.state.r, lanes.state.X2, *step.w, *step.v])
+        rows = jax.lax.dynamic_update_index_in_dim(rows, polynomial, row, 0)
         return after, rows, jax.lax.dynamic_update_index_in_dim(starts, begin, row, 0), row + 1
 
     blank = (jnp.zeros((length, WIDTH, L)), jnp.full((length, L), jnp.inf), jnp.int32(0))
@@ -382,26 +376,22 @@ def _without_padding(t: Trajectory, n: int) -> Trajectory:
     return replace(t, **{name: getattr(t, name)[:, :n] for name in ("times", "X1", "Y1", "X2", "Y2")})
 
 
-def kernel(max_steps: int) -> Kernel:
-    """The engine (p, e, law, initial, times) -> Trajectory on lanes.
+def kernel(
+    max_steps: int, p: CapsuleParameters, e: Drive, law: FrictionLaw, initial: Initial, times: jax.Array
+) -> Trajectory:
+    """The engine on lanes.
 
     Times are padded to one of few lengths, so that a new number of samples is seldom a new program, and records of a fit
     that differ little in length are traced once together.
     """
-
-    def simulate_exact(
-        p: CapsuleParameters, e: Drive, law: FrictionLaw, initial: Initial, times: jax.Array
-    ) -> Trajectory:
-        L, n = times.shape
-        bound, t_end = np.full(L, max_steps, np.int32), times[:, -1]
-        traced = is_traced((p, e, law, initial, times))
-        # A program of a fit runs often, and padding by more than twice the samples costs up to 40 % of its time.
-        length = next(size for k in range(64) if (size := SHORTEST * (2 if traced else 4) ** k) >= n)
-        padded = (jnp if traced else np).concatenate([times, np.full((L, length - n), np.inf)], axis=1)
-        # The samples of several lanes are scattered; a law, drive or force of the user may hold any operation.
-        single = L == 1 and not traced and all(map(_is_own, (e, law, *(p.forces or ()))))
-        given = p, e, law, initial, padded, t_end, bound
-        t = _run_single(*given)[0] if single else _run(*given)
-        return t if n == length else _without_padding(t, n)
-
-    return simulate_exact
+    L, n = times.shape
+    bound, t_end = np.full(L, max_steps, np.int32), times[:, -1]
+    traced = is_traced((p, e, law, initial, times))
+    # A program of a fit runs often, and padding by more than twice the samples costs up to 40 % of its time.
+    length = next(size for k in range(64) if (size := SHORTEST * (2 if traced else 4) ** k) >= n)
+    padded = (jnp if traced else np).concatenate([times, np.full((L, length - n), np.inf)], axis=1)
+    # The samples of several lanes are scattered; a law, drive or force of the user may hold any operation.
+    single = L == 1 and not traced and all(map(_is_own, (e, law, *(p.forces or ()))))
+    given = p, e, law, initial, padded, t_end, bound
+    t = _run_single(*given)[0] if single else _run(*given)
+    return t if n == length else _without_padding(t, n)

@@ -36,19 +36,8 @@ from capsule_id.physics.model import CapsuleParameters, Drive
 # It starts from R^(n) at the speed of the step's start, by Taylor-mode differentiation, so it is exact to rounding.
 
 
-def friction_series(
-    law: FrictionLaw, sigma: jax.Array, v: jax.Array, breakaway: tuple[jax.Array, jax.Array]
-) -> FrictionSeries:
-    """Friction from the velocity v (L,), m/s, on, in the direction sigma (L,): the law's own series if it has one.
-
-    breakaway : forward(0) and backward(0), each (L,), N, computed once per run
-    """
-    own = getattr(law, "series", None)
-    return by_chain_rule(law, sigma, v) if own is None else own(sigma, v, breakaway)
-
-
 def by_chain_rule(law: FrictionLaw, sigma: jax.Array, v: jax.Array) -> FrictionSeries:
-    """The series of any law, from its derivatives at the speed of the step's start."""
+    """Friction from the velocity v (L,), m/s, on, in the direction sigma (L,), from the law's derivatives there."""
     backward = sigma < 0.0
     unit = jnp.where(sigma != 0.0, sigma, jnp.inf)
 
@@ -312,7 +301,9 @@ def driven(constants: Constants, state: CapsuleState, mode: Mode) -> tuple[jax.A
 def series(constants: Constants, state: CapsuleState, mode: Mode, left: jax.Array) -> StepSeries:
     """Series of degree DEGREE about the state, in the mode; left (L,) s bounds the step."""
     sliding = mode.sigma != 0.0
-    friction = friction_series(constants.law, mode.sigma, state.v, (constants.F_forward, constants.F_backward))
+    own: Any = getattr(constants.law, "series", None)
+    breakaway, at = (constants.F_forward, constants.F_backward), (mode.sigma, state.v)
+    friction = by_chain_rule(constants.law, *at) if own is None else own(*at, breakaway)
     friction_rate = friction.rate((driven(constants, state, mode)[0] - friction.start) / constants.m2, constants.m2)
     guess = step_rate(constants, state, mode, jnp.where(sliding, friction_rate, 0.0))
     rate, rate_left = jax.lax.stop_gradient((guess, 1.0 / left))

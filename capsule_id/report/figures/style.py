@@ -137,8 +137,13 @@ def mark(figure: Figure, text: str) -> None:
     figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=SMALL, color=VERMILION, fontweight="bold")
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as PNG at 150 dpi, in a palette of its own; the same figure gives the same bytes."""
+def png(figure: Figure, synthetic: bool = False) -> bytes:
+    """The figure as PNG at 150 dpi, in a palette of its own; the same figure gives the same bytes.
+
+    synthetic : the figure shows synthetic data, which a word in it says from here on
+    """
+    if synthetic:
+        mark(figure, "synthetic data")
     canvas = FigureCanvasAgg(figure)
     with warnings.catch_warnings():
         # A label in a script that the font lacks shows as boxes; the figure is still usable, so the user is not warned.

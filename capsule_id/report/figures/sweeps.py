@@ -178,14 +178,9 @@ def mean_velocity(data: xr.Dataset, measured: Sequence[MeasuredPoint], ax: Axes)
             ax.plot(at[chosen], MM * velocity[chosen], ls="none", marker=marker, ms=3.0, color=colour, label=word)
     for i, value in enumerate(np.unique(at[label == "failed"])):
         ax.axvline(value, color=GREY, lw=0.8, ls=":", label=None if i else "run given up")
-    # Measured runs as the paper draws them, in red, each with the label of its own record.
-    look: dict[str, Any] = {"ls": "none", "marker": "D", "ms": 6.0, "mfc": "none", "mew": 1.6, "color": _MEASURED}
     for i, run in enumerate(measured):
         place = run.value / factor, MM * run.mean_velocity
-        ax.plot(*place, label=None if i else "measured", **look)
-        text = ax.annotate(run.label, place, xytext=(0, 8), textcoords="offset points", ha="center", color=_MEASURED)
-        # white about the letters: they stand among the points of the model
-        text.set(fontsize=SMALL - 1.0, path_effects=[withStroke(linewidth=2.5, foreground="white")], zorder=5)
+        _draw_measured(ax, place, run.label, None if i else "measured")
     low, high = ax.get_ylim()
     ax.set_ylim(low, high + 0.36 * (high - low))
     _write_labels(ax, x, label[0])
@@ -209,6 +204,14 @@ def _write_labels(ax: Axes, x: np.ndarray, label: np.ndarray) -> None:
         if right - left >= _ROOM_FOR_LABEL * (x[-1] - x[0]):
             place = 0.5 * (left + right), 0.88
             ax.text(*place, str(label[begin]), transform=ax.get_xaxis_transform(), parse_math=False, **small)
+
+
+def _draw_measured(ax: Axes, place: tuple[float, float], text: str, label: str | None) -> None:
+    """A measured run as the paper draws it, in red, with a text of its own."""
+    ax.plot(*place, ls="none", marker="D", ms=6.0, mfc="none", mew=1.6, color=_MEASURED, label=label)
+    words = ax.annotate(text, place, xytext=(0, 8), textcoords="offset points", ha="center", color=_MEASURED)
+    # white about the letters: they stand among the points of the model
+    words.set(fontsize=SMALL - 1.0, path_effects=[withStroke(linewidth=2.5, foreground="white")], zorder=5)
 
 
 def _dots(ax: Axes, x: np.ndarray, y: np.ndarray, **look: object) -> None:
@@ -345,10 +348,7 @@ def tuned(
         if len(place) < len(shown) or not all(low <= x <= high for x, (low, high) in zip(place, ends, strict=True)):
             continue
         at = (place[0], place[1] if shown[1:] else speed)
-        look: dict[str, Any] = {"ls": "none", "marker": "D", "ms": 6.0, "mfc": "none", "mew": 1.6, "color": _MEASURED}
-        ax.plot(*at, label="measured, mm/s" if first else None, **look)
-        text = ax.annotate(f"{speed:.3g}", at, xytext=(0, 8), textcoords="offset points", ha="center", parse_math=False)
-        text.set(fontsize=SMALL - 1.0, path_effects=[withStroke(linewidth=2.5, foreground="white")], color=_MEASURED)
+        _draw_measured(ax, at, f"{speed:.3g}", "measured, mm/s" if first else None)
         first = False
     set_legend(ax, "above")
     return figure
