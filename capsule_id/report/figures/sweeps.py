@@ -209,9 +209,11 @@ def _write_labels(ax: Axes, x: np.ndarray, label: np.ndarray) -> None:
 def _draw_measured(ax: Axes, place: tuple[float, float], text: str, label: str | None) -> None:
     """A measured run as the paper draws it, in red, with a text of its own."""
     ax.plot(*place, ls="none", marker="D", ms=6.0, mfc="none", mew=1.6, color=_MEASURED, label=label)
-    words = ax.annotate(text, place, xytext=(0, 8), textcoords="offset points", ha="center", color=_MEASURED)
+    words = ax.annotate(text, place, xytext=(0, 8), textcoords="offset points", ha="center", parse_math=False)
     # white about the letters: they stand among the points of the model
-    words.set(fontsize=SMALL - 1.0, path_effects=[withStroke(linewidth=2.5, foreground="white")], zorder=5)
+    words.set(
+        fontsize=SMALL - 1.0, path_effects=[withStroke(linewidth=2.5, foreground="white")], color=_MEASURED, zorder=5
+    )
 
 
 def _dots(ax: Axes, x: np.ndarray, y: np.ndarray, **look: object) -> None:
