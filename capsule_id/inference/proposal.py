@@ -534,11 +534,9 @@ def refined(
         good = list[bool]()
         for j, own in enumerate(blocks):
             size = own.add(u[:, first.blocks[j]], log_parts[:, j])
-            if i == 0:
-                kept = EXCELLENT if len(first.blocks[j]) <= LARGEST_MAP else ENOUGH
-                good.append(large[j] and size >= kept * DRAWS)
-            else:
-                good.append(size >= (ENOUGH if i >= SINGLE else EXCELLENT) * DRAWS)
+            late = i >= SINGLE or (i == 0 and len(first.blocks[j]) > LARGEST_MAP)
+            # The first proposal of a small block never stays.
+            good.append((i > 0 or large[j]) and size >= (ENOUGH if late else EXCELLENT) * DRAWS)
             own.next(good[j], rng)
         if all(good):
             break
