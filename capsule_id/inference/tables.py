@@ -232,15 +232,8 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
         if posterior is not None:
             draws = posterior.draws[..., i].ravel()
             lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
-            entry |= {
-                "value": median,
-                "sd": np.std(draws, ddof=1),
-                "basis": "sample",
-                "mean": np.mean(draws),
-                "median": median,
-                "lower": lower,
-                "upper": upper,
-            }
+            entry |= {"value": median, "sd": np.std(draws, ddof=1), "basis": "sample"}
+            entry |= {"mean": np.mean(draws), "median": median, "lower": lower, "upper": upper}
             entry |= {name: getattr(posterior, name)[i] for name in ("ess", "ess_bulk", "ess_tail", "rhat")}
         entry |= _widened(entry, sampled.widened.get(row.name), row.positive)
         entry |= _limited(entry) if row.positive else {}

@@ -338,7 +338,7 @@ def _within_loads(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
 def _standardised(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
     """Residuals (n,) over their sd at each load, where every load has enough rows."""
     levels = pd.Series(residuals).groupby(load)
-    if levels.size().min() < ROWS_OF_A_LOAD:
+    if np.min(levels.size().to_numpy()) < ROWS_OF_A_LOAD:
         return residuals
     return residuals / np.maximum(levels.transform("std").to_numpy(), SMALLEST_SCATTER)
 
