@@ -203,15 +203,14 @@ def compare_models(
         If a word is unknown, or a progression has too few settings or there is none.
     """
     choices, kinds = _variants(rig, words, registry)
+    report = progress or (lambda done, steps, name: None)
     fitted = {}
     for number, (name, model) in enumerate(choices.items()):
-        if progress:
-            progress(number, 2 * len(choices), name)
+        report(number, 2 * len(choices), name)
         fitted[name] = _fit_variant(replace(rig, model=model), kinds, seed)
     # The best first, so that hopeless variants are known when their turn comes.
     for number, name in enumerate(sorted(fitted, key=lambda name: -fitted[name].elpd)):
-        if progress:
-            progress(len(choices) + number, 2 * len(choices), name)
+        report(len(choices) + number, 2 * len(choices), name)
         difference, error = _difference(fitted[name], _best(fitted))
         # Weights with a large shape mostly overrate a variant; an infinite one hides the density of a setting.
         hopeless = np.isfinite(fitted[name].shape) and difference < -(HOPELESS + HOPELESS_ERRORS * error)

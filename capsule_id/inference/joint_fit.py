@@ -177,7 +177,7 @@ def joint_fit(
     if starts is None:
         # Another thread compiles the derivatives meanwhile; an error occurs again where they are used.
         with ThreadPoolExecutor(1) as pool:
-            pool.submit(_compile_descent, target)
+            pool.submit(linearised, target, dispersed_starts(target, seed, 1)[0])
             starts = choose_starts(target, known, seed, first or {})
     ends = _ends(target, starts)
     u, value = np.stack([end.u for end in ends]), np.array([end.value for end in ends])
@@ -236,11 +236,6 @@ def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
             limit = COST_RATIO_TO_ABANDON * float(best.fit.cost[0])
             ends += workers.map(partial(_search, target, limit=limit), own)
     return ends
-
-
-def _compile_descent(target: LogPosterior) -> None:
-    """Compile what ``_descend`` computes at a point."""
-    linearised(target, dispersed_starts(target, 0, 1)[0])
 
 
 def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
@@ -310,8 +305,7 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
         u[located] = fit.x[0]
         scatters = scatter_modes(target, u)
         shift = max((abs(scatters[i] - u[i]) for i in scatters), default=0.0)
-        for i, value in scatters.items():
-            u[i] = value
+        u[list(scatters)] = list(scatters.values())
         before, u = u, _rescaled(target, u)
         still = bool(moved < SMALL_MOVE_IN_SD and shift < SMALL_MOVE_IN_SD and np.array_equal(before, u))
         if still or fit.cost[0] > limit:

@@ -373,8 +373,7 @@ class MarginalPosterior:
         direction = np.random.default_rng(0).standard_normal((4 * self.rows, self.dimension))
         for block in self.blocks:
             direction[:, block] /= np.linalg.norm(direction[:, block], axis=1, keepdims=True)
-        kinked = self.target.kinked
-        farthest = FARTHEST_WITH_KINKS if kinked else FARTHEST
+        farthest = FARTHEST_WITH_KINKS if self.target.kinked else FARTHEST
         radius = np.concatenate([[0.0], np.geomspace(NEAREST, farthest, 2 * self.rows - 1)])
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
 

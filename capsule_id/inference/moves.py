@@ -189,10 +189,8 @@ class BlockMove(emcee.moves.Move):
 
     def step(self, log_density: Parts, coords: np.ndarray, parts: np.ndarray, random: Random) -> Step:
         proposal = self.proposal
-        drawn = proposal.draw(random, len(coords))
-        new = np.where(np.isfinite(drawn), drawn, coords)
         # A draw outside the domain has the density 0.
-        inside = np.stack([np.all(np.isfinite(drawn[:, block]), axis=1) for block in proposal.blocks], axis=1)
+        new, inside = proposal.draw_inside(random, len(coords), coords)
         factors = np.where(inside, proposal.log_density(coords) - proposal.log_density(new), -np.inf)
         return accept(random, coords, parts, new, log_density(new), factors, proposal.blocks)
 

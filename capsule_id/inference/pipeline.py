@@ -136,12 +136,8 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     stop_if_interrupted()
     before = [with_scaled(finding, sampled.experiments) for finding in before]
     checked = run_checks(replace(sampled, findings=before))
-    agreement = check_agreement(sampled)
-    checked = replace(
-        checked, findings=(*checked.findings, *sampled.findings, *agreement, *check_engine(sampled), *before)
-    )
-    widened = model_errors(checked)
-    findings = list(checked.findings)
+    findings = [*checked.findings, *sampled.findings, *check_agreement(sampled), *check_engine(sampled), *before]
+    widened = model_errors(replace(checked, findings=findings))
     for lost in (False, True):
         factors = [
             (name, one.factor, one.parts) for name, one in widened.items() if one.parts and one.no_number == lost
@@ -228,12 +224,11 @@ def _comparisons(
     """Return the panels, with flagged rows and predictive p-values."""
     panels = []
     for panel in compare(checked.experiments, checked.values, checked.draws, registry):
-        points = []
-        for part in panel.points:
-            mask = np.zeros(len(part.x), dtype=bool)
-            mask[checked.flagged.get(part.label, [])] = True
-            points.append(replace(part, flagged=mask))
-        panels.append(replace(panel, points=tuple(points), predictive_p=predictive.get(panel.label)))
+        points = tuple(
+            replace(part, flagged=np.isin(np.arange(len(part.x)), checked.flagged.get(part.label, [])))
+            for part in panel.points
+        )
+        panels.append(replace(panel, points=points, predictive_p=predictive.get(panel.label)))
     return tuple(panels)
 
 

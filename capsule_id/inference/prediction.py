@@ -309,9 +309,7 @@ def weighted_draws(
 
 def _known_draws(proposal: BlockProposal, random: Random) -> tuple[np.ndarray, np.ndarray]:
     """Draws (w, d) and their log-densities (w, blocks); +inf where a block has overflowed, at another place."""
-    v = proposal.draw(random, PROPOSED_DRAWS)
-    known = np.stack([np.all(np.isfinite(v[:, block]), axis=1) for block in proposal.blocks], axis=1)
-    v = np.where(np.isfinite(v), v, np.nanmean(v, axis=0))
+    v, known = proposal.draw_inside(random, PROPOSED_DRAWS)
     return v, np.where(known, proposal.log_density(v), np.inf)
 
 

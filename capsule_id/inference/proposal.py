@@ -250,6 +250,19 @@ class BlockProposal:
             u[:, block] = density.draw(rng, size)
         return u
 
+    def draw_inside(
+        self, rng: Random, size: int, instead: Points | None = None
+    ) -> tuple[Points, Bool[np.ndarray, "n blocks"]]:
+        """Draw u, and whether the parameters of each block have a value; those without one are at other places.
+
+        Parameters
+        ----------
+        instead : (size, d) of the other places; by default the mean of the draws
+        """
+        u = self.draw(rng, size)
+        inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in self.blocks], axis=1)
+        return np.where(np.isfinite(u), u, np.nanmean(u, axis=0) if instead is None else instead), inside
+
 
 def block_proposal(
     blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix, narrow: Sequence[bool] | None = None
@@ -515,19 +528,15 @@ def refined(
     blocks = [_Rounds(mixture, prior[:, block], own) for block, mixture, own in pairs]
     proposal = first
     for i in range(rounds or ROUNDS):
-        u = proposal.draw(rng, DRAWS)
-        inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in first.blocks], axis=1)
-        u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
+        u, inside = proposal.draw_inside(rng, DRAWS)
         found = parts(u)
         log_parts = np.where(inside & ~np.isnan(found), found, -np.inf)
         good = list[bool]()
         for j, own in enumerate(blocks):
             size = own.add(u[:, first.blocks[j]], log_parts[:, j])
-            if i == 0:
-                kept = EXCELLENT if len(first.blocks[j]) <= LARGEST_MAP else ENOUGH
-                good.append(large[j] and size >= kept * DRAWS)
-            else:
-                good.append(size >= (ENOUGH if i >= SINGLE else EXCELLENT) * DRAWS)
+            late = i >= SINGLE or (i == 0 and len(first.blocks[j]) > LARGEST_MAP)
+            # The first proposal of a small block never stays.
+            good.append((i > 0 or large[j]) and size >= (ENOUGH if late else EXCELLENT) * DRAWS)
             own.next(good[j], rng)
         if all(good):
             break

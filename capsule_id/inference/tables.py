@@ -240,16 +240,19 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
         rows.append((row, {**entry, "quote": quote(entry, row.positive)}))
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
-        exact = dict.fromkeys(("value", "paper", "map", "mean", "median", "lower", "upper"), value)
-        errors = {"standard_error": 0.0, "sd": 0.0}
-        said = {
+        exact = {
+            **dict.fromkeys(("value", "paper", "map", "mean", "median", "lower", "upper"), value),
+            "standard_error": 0.0,
+            "sd": 0.0,
             "basis": "point" if posterior is None else "sample",
             "quote": "sd",
             "trust": "not judged" if posterior is None else "trusted",
+            "unit": row.unit,
+            "meaning": f"{row.meaning} (exact)",
+            "informed": True,
+            "not_in_sd": "",
         }
-        said |= {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, "not_in_sd": ""}
-        entry = {**exact, **errors, **said}
-        rows.append((row, entry))
+        rows.append((row, exact))
     physical, nuisances = (
         pd.DataFrame.from_dict({row.name: entry for row, entry in rows if row.physical == chosen}, orient="index")
         .reindex(columns=list(SUMMARY_COLUMNS))

@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from scipy import optimize, stats
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol, estimate, refit
@@ -45,8 +46,7 @@ def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, n
     sizes = [row.prior.spread if row.prior and row.symbol in INSTRUMENT_ERRORS else 1e-12 for row in rows]
 
     def residuals(v: np.ndarray) -> np.ndarray:
-        moved = {**theta, **dict(zip(keys, v, strict=True))}
-        return experiment.misfit(moved).raw
+        return experiment.misfit({**theta, **dict(zip(keys, v, strict=True))}).raw
 
     misfit = experiment.misfit(theta)
     sd, at = misfit.sd, np.array([float(theta[s]) for s in keys])
@@ -329,20 +329,18 @@ def trend(residuals: np.ndarray, load: np.ndarray) -> float:
 
 def _within_loads(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
     """Residuals (n,) without their mean at each load, or, where loads have few rows, without a line in its logarithm."""
-    groups = np.unique(load, return_inverse=True)[1]
-    size = np.bincount(groups)
-    if len(load) >= ROWS_OF_A_LOAD * len(size):
-        return residuals - (np.bincount(groups, residuals) / size)[groups]
+    levels = pd.Series(residuals).groupby(load)
+    if len(load) >= ROWS_OF_A_LOAD * levels.ngroups:
+        return residuals - levels.transform("mean").to_numpy()
     return residuals - np.polyval(np.polyfit(np.log(load), residuals, 1), np.log(load))
 
 
 def _standardised(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
     """Residuals (n,) over their sd at each load, where every load has enough rows."""
-    groups = np.unique(load, return_inverse=True)[1]
-    if np.min(np.bincount(groups)) < ROWS_OF_A_LOAD:
+    levels = pd.Series(residuals).groupby(load)
+    if np.min(levels.size().to_numpy()) < ROWS_OF_A_LOAD:
         return residuals
-    sd = np.array([np.std(own, ddof=1) for own in at_each_load(residuals, load)])
-    return residuals / np.maximum(sd, SMALLEST_SCATTER)[groups]
+    return residuals / np.maximum(levels.transform("std").to_numpy(), SMALLEST_SCATTER)
 
 
 def _loads(s: SampledFit, e: Experiment) -> list[np.ndarray]:
