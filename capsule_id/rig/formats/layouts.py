@@ -21,7 +21,6 @@ from capsule_id.rig.formats.raw import (
     RawTable,
     TextFile,
     lines_of,
-    numbers_of,
     refuse_line,
     refuse_wide,
 )
@@ -88,20 +87,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     headers = tuple(names for _, names in found)
     wanted = [k for k in range(width) if layout.columns is None or is_wanted(k, headers, layout.columns)]
     decimal = "." if delimiter == "," else layout.decimal
-    shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
-    words = [k for k in wanted if is_wanted(k, headers, layout.words)]
-    first_rows = (
-        texts_of(line, delimiter) for line in islice(filter(is_row, file.lines(first)), 1 + 2 * MOST_TITLES // width)
-    )
-    columns = zip(*(cells for cells in first_rows if len(cells) >= width), strict=False)
-    # The reader in C takes every mark for the decimal one.
-    quick = not numbers_of(layout.missing) and (
-        decimal is not None or not apart_marks([*columns], layout.missing, None)
-    )
-    rows = rows_of(file, shape, wanted, None, words) if quick else None
     stated = decimal is not None and layout.decimal == decimal
-    rows = rows or rows_of(file, replace(shape, decimal=decimal, stated=stated), wanted, layout.missing, words)
-    assert rows is not None, "any cell is read with a list of markers"
+    shape = Shape(first, delimiter, width, decimal, trailing, stated)
+    rows = rows_of(file, shape, wanted, layout.missing, [k for k in wanted if is_wanted(k, headers, layout.words)])
     lines = rows.lines
 
     def place(row: int | None, column: int) -> Place:
@@ -136,38 +124,29 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
     InputError
         If there is none, or the first line with a number is no row of readings.
     """
-    lines: list[str] = []
-    begun, row = None, 0
-    for i, line in enumerate(file.lines()):
-        lines.append(line)
-        if i >= MOST_TITLES and layout.data_from_line is None:
-            break
-        if is_comment(line):
-            continue
-        if layout.data_from_line is not None:
-            if i + 1 >= layout.data_from_line and line.strip():
-                return lines
-            continue
-        cells = split_bare(line, delimiter_of(line, layout))
-        if begun is None and any(is_number(cell) for cell in cells):
-            begun, row, cells = i, i, _mapped(cells, lines, layout)
-        if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
-            if i == begun:
-                return lines
-            row = i
-            break
+    stated = layout.data_from_line
+    lines = islice(file.lines(), MOST_TITLES if stated is None else None)
+    rows = ((k, line) for k, line in enumerate(lines) if not is_comment(line))
+    if stated is not None:
+        begun = next((k for k, line in rows if k + 1 >= stated and line.strip()), None)
+    else:
+        begun = next((k for k, line in rows if any(map(is_number, _cells(line, layout)))), None)
     if begun is None:
         raise InputError(
             f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
             "none",
             "export the readings as numbers, a row in each line",
             file.path,
-            1 if layout.data_from_line is None else len(lines),
+            1 if stated is None else sum(1 for _ in file.lines()),
             1,
         )
+    head = list(islice(file.lines(), begun + 1))
+    if stated is not None or _are_readings(_mapped(head, layout), layout):
+        return head
+    row = next((k for k, line in rows if _are_readings(_cells(line, layout), layout)), begun)
     raise InputError(
         "the first line with a number must be a row of readings, or data_from_line stated",
-        shown(lines[begun].strip()),
+        shown(head[begun].strip()),
         f"state data_from_line = {row + 1}, or the line of the first reading",
         file.path,
         begun + 1,
@@ -175,9 +154,20 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
     )
 
 
-def _mapped(cells: list[str], lines: list[str], layout: Layout) -> list[str]:
+def _cells(line: str, layout: Layout) -> list[str]:
+    """The cells of a line by its own separator."""
+    return split_bare(line, delimiter_of(line, layout))
+
+
+def _are_readings(cells: list[str], layout: Layout) -> bool:
+    """Whether some of these cells are not empty, and all of those are readings."""
+    return any(cells) and all(not cell or _is_reading(cell, layout) for cell in cells)
+
+
+def _mapped(lines: list[str], layout: Layout) -> list[str]:
     """The cells of the first row with a number, the last of ``lines``, that are read as numbers; all without a map."""
     *above, row = lines
+    cells = _cells(row, layout)
     found = (_headers(line, delimiter_of(row, layout), len(cells)) for line in above)
     headers = tuple(names for names in found if names)
     wanted = [k for k in range(len(cells)) if is_wanted(k, headers, layout.columns or ())]
@@ -487,7 +477,6 @@ def _by_cells(
         table[number] = separator.join(f'"{cell}' if is_comment(cell) else cell for cell in cells)
     file, shape = TextFile("\n".join(table).encode(), text.path), Shape(segments[0].first, separator, width, decimal)
     rows = rows_of(file, shape, range(width), missing)
-    assert rows is not None, "any cell is read with a list of markers"
 
     def column(index: int) -> np.ndarray:
         kept = np.ones(len(table), dtype=bool)

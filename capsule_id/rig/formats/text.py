@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
 
@@ -346,15 +346,11 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
 
 
 def rows_of(
-    file: TextFile,
-    shape: Shape,
-    columns: Sequence[int],
-    missing: Sequence[str] | None = None,
-    words: Sequence[int] = (),
-) -> Rows | None:
+    file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str], words: Sequence[int] = ()
+) -> Rows:
     """The rows of a text, with NaN at a missing marker, and the texts of the columns ``words``.
 
-    Blocks of numbers alone are read by the reader in C. Without a list ``missing``: None for a text with any other block.
+    Blocks of numbers alone are read by the reader in C where their decimal mark is known, or no other can be meant.
 
     Raises
     ------
@@ -362,18 +358,17 @@ def rows_of(
         If a row has another number of cells than the first one.
     """
     rows = Rows({column: [] for column in columns}, {column: [] for column in words})
-    markers, marks, codes = missing or (), dict.fromkeys(columns, shape.decimal), numbers_of(missing or ())
+    marks, codes = dict.fromkeys(columns, shape.decimal), numbers_of(missing)
     alone, apart = not words and not codes, None  # the reader in C would take a code for a reading
     for number, block in file.blocks(shape.first):
-        # No other decimal mark than that of the reader in C can be meant.
-        plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
-        values = plain_block(block, shape, columns) if plain else None
+        known = {shape.decimal, *marks.values()} - {None}
+        plain = alone and not apart and len(known) < 2 and (known or b"." not in block)
+        of_block = replace(shape, decimal=max(known, default="."))
+        values = plain_block(block, of_block, columns) if plain else None
         every = enumerate(lines_of(block) if values is None else (), number)
         kept = [(line, row) for line, row in every if is_row(row)]
         if values is None and plain and len(kept) < block.count(b"\n"):  # blank lines or comments
-            values = plain_block("\n".join([*(text for _, text in kept), ""]).encode(), shape, columns)
-        if values is None and kept and missing is None:
-            return None
+            values = plain_block("\n".join([*(text for _, text in kept), ""]).encode(), of_block, columns)
         lines = [line for line, _ in kept] if kept or values is None else np.arange(number, number + len(values))
         rows.blocks.append(np.array(lines, np.int32) + 1)
         if values is not None:
@@ -383,7 +378,7 @@ def rows_of(
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         turned = [*zip(*cells, strict=True)] or [()] * shape.width
         if apart is None:
-            apart = apart_marks(turned, markers, shape.decimal) if shape.decimal is None or shape.stated else {}
+            apart = apart_marks(turned, missing, shape.decimal) if shape.decimal is None or shape.stated else {}
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
             texts = [text.replace(mark, "") for text in texts] if (mark := apart.get(column, "")) else texts
@@ -391,7 +386,7 @@ def rows_of(
                 rows.texts[column] += map(sys.intern, texts)
             if column in rows.faults:  # the first fault counts, and a later block may not show it
                 continue
-            marks[column] = marks[column] or decimal_mark(texts, markers)
+            marks[column] = marks[column] or decimal_mark(texts, missing)
 
             def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> Place:
                 line, text = kept[k]
@@ -400,7 +395,7 @@ def rows_of(
             try:
                 if mark is None:
                     raise _ambiguous(texts, turned, place)
-                found = read_column(texts, marks[column] or ".", markers, place)
+                found = read_column(texts, marks[column] or ".", missing, place)
                 rows.numbers[column].append(np.where(np.isin(found, codes), np.nan, found) if codes else found)
             except InputError as error:
                 rows.faults[column] = error
