@@ -28,10 +28,8 @@ from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Shape,
-    apart_marks,
     bare,
     cells_of,
-    decimal_mark,
     is_comment,
     is_row,
     is_stamp,
@@ -97,7 +95,7 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
     texts, every = rows.words, lambda: (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
-    return Export(path, headers, width, lines, rows.column, place, file.encoding, texts, cells=every)
+    return Export(path, headers, width, lines, rows.column, place, file.encoding, texts, cells=every, marks=rows.marks)
 
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
@@ -297,7 +295,7 @@ def read_csv(content: bytes, path: Path) -> RawTable:
         raise InputError(rule, found, "correct the row, or the header", path, line, place)
     layout = Layout(line, missing=NO_READING, decimal="." if mark == "," and width > 1 else None)
     export = read_text(content, path, layout)
-    _refuse_two_marks(file, mark)
+    _refuse_two_marks(export)
     bare_rows = _lines_without_cells(file, export.lines)
     last = [np.full(len(export.lines), np.nan)] * (width - export.width)  # every last cell is empty
     columns = (*map(export.values, range(export.width)), *last)
@@ -311,26 +309,14 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     return replace(raw.taken(np.flatnonzero(~missing)), lost=lost)
 
 
-def _refuse_two_marks(file: TextFile, delimiter: str) -> None:
+def _refuse_two_marks(export: Export) -> None:
     """Refuse a table with decimal points in one column and decimal commas in another: a mark stands in a damaged cell."""
-    if delimiter == "," or not all(any(mark in block for _, block in file.blocks(1)) for mark in (b",", b".")):
-        return
-    rows = [(number, row) for number, row in enumerate(file.lines(1), 2) if is_row(row)]
-    columns = [*zip(*(texts_of(row, delimiter) for _, row in rows), strict=True)]
-    apart = apart_marks(columns, NO_READING, None)
-    # A column that leaves open what its mark parts is asked about when it is read.
-    texts = {k: [text.replace(apart.get(k) or " ", "") for text in column] for k, column in enumerate(columns)}
-    marks = {k: decimal_mark(column, NO_READING) for k, column in texts.items() if apart.get(k, "") is not None}
-    marks = {k: mark for k, mark in marks.items() if mark}
-    for k, mark in marks.items():
+    marks = {column: mark for column, mark in export.marks.items() if mark}
+    for column, mark in marks.items():
         if mark != next(iter(marks.values())):
-            number, row = next(
-                (number, row) for text, (number, row) in zip(texts[k], rows, strict=True) if mark in text
-            )
-            place = place_of_cell(row, delimiter, k)
-            raise InputError(
-                "a cell must be a number", shown(texts_of(row, delimiter)[k]), _ONE_MARK, file.path, number, place
-            )
+            assert export.cells is not None, "a text has cells"
+            row, cell = next((k, each[column]) for k, each in enumerate(export.cells()) if mark in each[column])
+            raise InputError("a cell must be a number", shown(cell), _ONE_MARK, *export.place(row, column))
 
 
 def _lines_without_cells(file: TextFile, rows: np.ndarray) -> list[int]:

@@ -373,6 +373,7 @@ class Export:
     words : index of a column that ``Layout.words`` names -> (rows,) its texts; None: the format has no texts
     sheet, others : names of the sheet of a workbook that was read, "" of another format, and of others with numbers
     cells : the texts of each row of a text or a sheet, read or not; None: the format has no such rows
+    marks : decimal marks of the columns of a text, where their numbers show them
     """
 
     path: Path
@@ -386,6 +387,7 @@ class Export:
     sheet: str = ""
     others: tuple[str, ...] = ()
     cells: Callable[[], Iterable[list[str]]] | None = None
+    marks: Mapping[int, str | None] = field(default_factory=dict)
 
 
 # arrays: Makes an export of named arrays: the form of every format without lines.

@@ -125,7 +125,7 @@ def mark_apart(written: str) -> Iterator[str]:
 
 def read_column(
     texts: Sequence[str],
-    decimal: str | None,
+    mark: str,
     missing: Sequence[str],
     place: Callable[[int], Place],
 ) -> np.ndarray:
@@ -134,7 +134,7 @@ def read_column(
     Parameters
     ----------
     texts : the cells
-    decimal : decimal mark (None: the first point or comma of the column)
+    mark : decimal mark
     missing : texts of cells without a reading
     place : file, line and column of a cell, for error lines
 
@@ -143,7 +143,6 @@ def read_column(
     InputError
         At the first cell that is neither a finite number nor a marker.
     """
-    mark = decimal or decimal_mark(texts, missing) or "."
     markers, values = frozenset(missing), np.full(len(texts), np.nan)
     all_used = markers.isdisjoint(texts)
     used = range(len(texts)) if all_used else [k for k, text in enumerate(texts) if text not in markers]
@@ -278,10 +277,12 @@ class Rows:
     faults : of a column, the error at its first cell that is no number
     texts : of each column whose texts are kept
     blocks : 1-based lines of the rows of every block
+    marks : decimal mark of each column that is read; None: its numbers show none, or leave open what theirs parts
     """
 
     numbers: dict[int, list[np.ndarray]]
     texts: dict[int, list[str]]
+    marks: dict[int, str | None]
     faults: dict[int, InputError] = field(default_factory=dict)
     blocks: list[np.ndarray] = field(default_factory=list)
 
@@ -357,8 +358,8 @@ def rows_of(
     InputError
         If a row has another number of cells than the first one.
     """
-    rows = Rows({column: [] for column in columns}, {column: [] for column in words})
     marks, codes = dict.fromkeys(columns, shape.decimal), numbers_of(missing)
+    rows = Rows({column: [] for column in columns}, {column: [] for column in words}, marks)
     alone, apart = not words and not codes, None  # the reader in C would take a code for a reading
     for number, block in file.blocks(shape.first):
         known = {shape.decimal, *marks.values()} - {None}
@@ -386,7 +387,6 @@ def rows_of(
                 rows.texts[column] += map(sys.intern, texts)
             if column in rows.faults:  # the first fault counts, and a later block may not show it
                 continue
-            marks[column] = marks[column] or decimal_mark(texts, missing)
 
             def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> Place:
                 line, text = kept[k]
@@ -395,6 +395,7 @@ def rows_of(
             try:
                 if mark is None:
                     raise _ambiguous(texts, turned, place)
+                marks[column] = marks[column] or decimal_mark(texts, missing)
                 found = read_column(texts, marks[column] or ".", missing, place)
                 rows.numbers[column].append(np.where(np.isin(found, codes), np.nan, found) if codes else found)
             except InputError as error:
