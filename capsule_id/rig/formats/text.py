@@ -362,7 +362,7 @@ def rows_of(
     rows = Rows({column: [] for column in columns}, {column: [] for column in words}, marks)
     alone, apart = not words and not codes, None  # the reader in C would take a code for a reading
     for number, block in file.blocks(shape.first):
-        known = {shape.decimal, *marks.values()} - {None}
+        known = {mark for mark in (shape.decimal, *marks.values()) if mark}
         plain = alone and not apart and len(known) < 2 and (known or b"." not in block)
         of_block = replace(shape, decimal=max(known, default="."))
         values = plain_block(block, of_block, columns) if plain else None
