@@ -290,9 +290,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
         export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
-    numbers = tuple(index + 1 for index in unread)
-    again = EXPORTS[suffix](content, path, replace(layout, columns=numbers, words=numbers)) if numbers else export
-    texts = {index: again.words(index).tolist() for index in unread} if again.words else {}
+    texts = {index: [row[index] for row in export.cells()] for index in unread} if export.cells else {}
     stamps = {index: values for index in texts if (values := _stamps(texts[index], export, layout, index)) is not None}
     read_too = {index: error for index, error in unread.items() if index not in stamps}
     rate, every = _rate(beginning, names, singles), {**columns, **stamps}
