@@ -469,14 +469,16 @@ class _Part:
             )
         found = list[np.ndarray]()
         for export, index in named:
-            read = export.words if texts else export.values
-            if read is None:
+            if not texts:
+                found.append(export.values(index))
+            elif export.cells is not None:  # as objects: one long text must not widen all
+                found.append(np.array([row[index] for row in export.cells()], dtype=object))
+            else:
                 raise node.error(
                     f"{node.key} takes numbers for a {export.path.suffix} file",
                     "a text",
                     "write a number, or export the file as CSV",
                 )
-            found.append(read(index))
             self.rows = self.rows or found[-1].size
             if found[-1].size != self.rows:
                 raise node.error(

@@ -87,15 +87,17 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     decimal = "." if delimiter == "," else layout.decimal
     stated = decimal is not None and layout.decimal == decimal
     shape = Shape(first, delimiter, width, decimal, trailing, stated)
-    rows = rows_of(file, shape, wanted, layout.missing, [k for k in wanted if is_wanted(k, headers, layout.words)])
+    rows = rows_of(file, shape, wanted, layout.missing)
     lines = rows.lines
 
     def place(row: int | None, column: int) -> Place:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    texts, every = rows.words, lambda: (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
-    return Export(path, headers, width, lines, rows.column, place, file.encoding, texts, cells=every, marks=rows.marks)
+    def every() -> Iterator[list[str]]:
+        return (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
+
+    return Export(path, headers, width, lines, rows.column, place, file.encoding, cells=every, marks=rows.marks)
 
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:

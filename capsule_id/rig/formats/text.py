@@ -4,7 +4,6 @@ import io
 import json
 import math
 import re
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -275,13 +274,11 @@ class Rows:
     ----------
     numbers : of each column that is read: those of every block
     faults : of a column, the error at its first cell that is no number
-    texts : of each column whose texts are kept
     blocks : 1-based lines of the rows of every block
     marks : decimal mark of each column that is read; None: its numbers show none, or leave open what theirs parts
     """
 
     numbers: dict[int, list[np.ndarray]]
-    texts: dict[int, list[str]]
     marks: dict[int, str | None]
     faults: dict[int, InputError] = field(default_factory=dict)
     blocks: list[np.ndarray] = field(default_factory=list)
@@ -302,10 +299,6 @@ class Rows:
         if index in self.faults:
             raise self.faults[index]
         return np.concatenate([np.empty(0), *self.numbers[index]])
-
-    def words(self, index: int) -> np.ndarray:
-        """The texts of a column, (rows,), as objects: one long text must not widen all."""
-        return np.array(self.texts[index], dtype=object)
 
 
 def is_comment(line: str) -> bool:
@@ -346,10 +339,8 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     return values[:, np.searchsorted(used, columns)] if exact else None
 
 
-def rows_of(
-    file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str], words: Sequence[int] = ()
-) -> Rows:
-    """The rows of a text, with NaN at a missing marker, and the texts of the columns ``words``.
+def rows_of(file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str]) -> Rows:
+    """The rows of a text, with NaN at a missing marker.
 
     Blocks of numbers alone are read by the reader in C where their decimal mark is known, or no other can be meant.
 
@@ -359,11 +350,12 @@ def rows_of(
         If a row has another number of cells than the first one.
     """
     marks, codes = dict.fromkeys(columns, shape.decimal), numbers_of(missing)
-    rows = Rows({column: [] for column in columns}, {column: [] for column in words}, marks)
-    alone, apart = not words and not codes, None  # the reader in C would take a code for a reading
+    rows = Rows({column: [] for column in columns}, marks)
+    apart = None
     for number, block in file.blocks(shape.first):
         known = {mark for mark in (shape.decimal, *marks.values()) if mark}
-        plain = alone and not apart and len(known) < 2 and (known or b"." not in block)
+        # The reader in C would take a code for a reading.
+        plain = not codes and not apart and len(known) < 2 and (known or b"." not in block)
         of_block = replace(shape, decimal=max(known, default="."))
         values = plain_block(block, of_block, columns) if plain else None
         every = enumerate(lines_of(block) if values is None else (), number)
@@ -383,8 +375,6 @@ def rows_of(
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
             texts = [text.replace(mark, "") for text in texts] if (mark := apart.get(column, "")) else texts
-            if column in words:
-                rows.texts[column] += map(sys.intern, texts)
             if column in rows.faults:  # the first fault counts, and a later block may not show it
                 continue
 
