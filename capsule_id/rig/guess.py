@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from capsule_id.errors import InputError, printable
+from capsule_id.errors import InputError, collecting, printable
 from capsule_id.parameters import ROUNDING
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats import EXPORTS, TEXTS, suffix_of
@@ -32,7 +32,7 @@ from capsule_id.rig.formats.raw import (
 from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.times import evened
-from capsule_id.rig.toml import shown
+from capsule_id.rig.toml import LARGEST, shown
 from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si, scale, symbol_named
 from capsule_id.views import counted
 
@@ -290,9 +290,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
         export, (columns, singles, unread) = read(layout)
     # Entries quote them as comments of rig.toml, which hold no control characters.
     names, units = (tuple(map(printable, texts)) for texts in _headers(export, dimensions))
-    numbers = tuple(index + 1 for index in unread)
-    again = EXPORTS[suffix](content, path, replace(layout, columns=numbers, words=numbers)) if numbers else export
-    texts = {index: again.words(index).tolist() for index in unread} if again.words else {}
+    texts = {index: [row[index] for row in export.cells()] for index in unread} if export.cells else {}
     stamps = {index: values for index in texts if (values := _stamps(texts[index], export, layout, index)) is not None}
     read_too = {index: error for index, error in unread.items() if index not in stamps}
     rate, every = _rate(beginning, names, singles), {**columns, **stamps}
@@ -371,37 +369,31 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
     InputError
         The error of the default layout, where no line begins rows of numbers.
     """
-    read = EXPORTS[suffix_of(path)]
-    first: InputError | None = None
+    faults = list[InputError]()
     lines = [None, *range(1, min(_MOST_TITLES, beginning.count(b"\n") + 1) + 1)]
     for line in lines:
         for decimal in (None, ".", ","):
             layout = Layout(line, missing=NO_READING, decimal=decimal)
-            try:
-                export = read(beginning, path, layout)
-            except InputError as error:
-                first = first or error
-                continue
-            names = [name for row in export.headers[:1] for name in row if name.strip() and not is_number(name)]
-            if decimal == "." and not 1 < export.width == len(names):
-                continue  # whole numbers between commas are no decimals where the header names each of several columns
-            columns, _, unread = _readings(export)
-            if not columns and unread:
-                first = first or unread[min(unread)]
-            if columns and len(export.lines) == 1:
-                few = (
-                    "an export must have two rows of numbers or more",
-                    "one row",
-                    "export all readings into one file",
-                )
-                first = first or InputError(*few, path, int(export.lines[0]))
-            if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
-                runs, longest = _runs([beginning], layout) if line is not None else ([], None)
-                if any(run[2] < (line or 0) for run in runs if longest is not None and run[0] == longest):
-                    break  # rows like those of the longest block lie above the line
-                return layout
-    assert first is not None, "every layout was refused"
-    raise first
+            with collecting(faults):
+                export = EXPORTS[suffix_of(path)](beginning, path, layout)
+                names = [name for row in export.headers[:1] for name in row if name.strip() and not is_number(name)]
+                if decimal == "." and not 1 < export.width == len(names):
+                    continue  # whole numbers between commas are no decimals where the header names each of several columns
+                columns, _, unread = _readings(export)
+                if not columns and unread:
+                    raise unread[min(unread)]
+                if columns and len(export.lines) == 1:
+                    rule, remedy = (
+                        "an export must have two rows of numbers or more",
+                        "export all readings into one file",
+                    )
+                    raise InputError(rule, "one row", remedy, path, int(export.lines[0]))
+                if any(np.isfinite(values[0]) for values in columns.values()):
+                    runs, longest = _runs([beginning], layout) if line is not None else ([], None)
+                    if any(run[2] < (line or 0) for run in runs if longest is not None and run[0] == longest):
+                        break  # rows like those of the longest block lie above the line
+                    return layout
+    raise faults[0]
 
 
 def _readings(export: Export) -> Readings:
@@ -474,9 +466,8 @@ MOST_TRIALS, MOST_CELLS = 1000, 20_000
 CHANCE, OUTSIDE, MOST_BELOW, FEWEST_ABOVE = 2e-5, 1e-2, 4, 3
 #: Largest difference of a rounded number from the exact one, in units of its last digit, with a margin.
 HALF_DIGIT = 0.51
-#: Numbers that programs write for no reading, and the size from which no reading of a rig is.
+#: Numbers that programs write for no reading.
 _NO_READING = re.compile(r"-?(?:9{3,}(?:\.(?:9+|25))?|9{2,}\.9+)|32767|-32768|65535|2147483647|-2147483648")
-BEYOND = 1e30
 #: Distance of such a number from all others, in ranges of those: of one alone, and of one that is repeated.
 FAR_ALONE, FAR = 10.0, 1.0
 
@@ -488,7 +479,7 @@ def code_in(values: np.ndarray) -> float | None:
         rest = finite[finite != end]
         apart = FAR_ALONE if finite.size - rest.size == 1 else FAR
         known = rest.size > 1 and _NO_READING.fullmatch(f"{end:.7g}")
-        if abs(end) >= BEYOND or (known and min(np.abs([rest.min() - end, rest.max() - end])) > apart * np.ptp(rest)):
+        if abs(end) >= LARGEST or (known and min(np.abs([rest.min() - end, rest.max() - end])) > apart * np.ptp(rest)):
             return end
     return None
 

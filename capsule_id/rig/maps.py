@@ -459,16 +459,26 @@ class _Part:
 
     def find(self, node: Node, header: Header, texts: bool = False) -> Found:
         """The column ``header``, stated at ``node`` of ``rig.toml``: its numbers, or its ``texts``."""
-        named, found = self._columns(node, header), list[np.ndarray]()
+        named = [(export, column) for export in self.exports for column in self._column(node, export, header)]
+        if not named:
+            known = [name for export in self.exports for row in export.headers for name in row if name]
+            raise node.error(
+                f"{node.key} must be a header of the file",
+                f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}",
+                remedy_for(str(header), known, "write the number of the column, counted from 1"),
+            )
+        found = list[np.ndarray]()
         for export, index in named:
-            read = export.words if texts else export.values
-            if read is None:
+            if not texts:
+                found.append(export.values(index))
+            elif export.cells is not None:  # as objects: one long text must not widen all
+                found.append(np.array([row[index] for row in export.cells()], dtype=object))
+            else:
                 raise node.error(
                     f"{node.key} takes numbers for a {export.path.suffix} file",
                     "a text",
                     "write a number, or export the file as CSV",
                 )
-            found.append(read(index))
             self.rows = self.rows or found[-1].size
             if found[-1].size != self.rows:
                 raise node.error(
@@ -490,18 +500,6 @@ class _Part:
         (first, column), values = named[0], found[0]
         place = first.place  # the numbers of the file are not kept beside the table
         return values, lambda row: place(row, column)
-
-    def _columns(self, node: Node, header: Header) -> list[tuple[Export, int]]:
-        """The files that have the column ``header``, each with its index there; at least one."""
-        found = [(export, column) for export in self.exports for column in self._column(node, export, header)]
-        if not found:
-            known = [name for export in self.exports for row in export.headers for name in row if name]
-            raise node.error(
-                f"{node.key} must be a header of the file",
-                f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}",
-                remedy_for(str(header), known, "write the number of the column, counted from 1"),
-            )
-        return found
 
     def _column(self, node: Node, export: Export, header: Header) -> list[int]:
         """Index of a column in one file; none if the file does not have the header."""

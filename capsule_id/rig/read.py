@@ -60,8 +60,6 @@ from capsule_id.views import Finding
 
 
 _READING_ERRORS = ("_sd", "_resolution", "_instrument")
-#: Smallest stated reading error relative to the largest reading; below it rounding exceeds the error.
-SMALLEST_RELATIVE_ERROR = ROUNDING
 
 
 def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequence[Parameter] = ()) -> Rig:
@@ -285,13 +283,14 @@ def _read_experiment(
 
 def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
     """The column with its stated sd and resolution."""
-    smallest = SMALLEST_RELATIVE_ERROR * max(np.max(column.values), -np.min(column.values))
+    # Below it rounding exceeds the error.
+    smallest = ROUNDING * max(np.max(column.values), -np.min(column.values))
     stated: list[float | None] = []
     for key in (f"{column.name}_sd", f"{column.name}_resolution"):
         size = entry[key].quantity(kind.columns[column.name].si).value if key in entry else None
         if size is not None and size < smallest:
             raise entry[key].error(
-                f"{key} must not be below {SMALLEST_RELATIVE_ERROR:g} of the largest reading ({smallest:.1g} in SI units)",
+                f"{key} must not be below {ROUNDING:g} of the largest reading ({smallest:.1g} in SI units)",
                 f"{size:g}",
                 "correct the value or its unit, or remove it",
             )

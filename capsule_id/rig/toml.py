@@ -78,32 +78,7 @@ _HEADER, _END, _DOT, _EQUALS = (re.compile(rf"[ \t]*{form}[ \t]*") for form in (
 _CLOSE = re.compile(r"[\]}]")
 
 
-@dataclass(frozen=True)
-class TomlDocument:
-    """A parsed TOML file with the place of each key and value.
-
-    Attributes
-    ----------
-    path : the file, as given by the user
-    data : the content as tomllib returns it
-    keys, values : offset of every key and value by key path, e.g. ("experiment", 0, "kind")
-    text : the file's text with ``\\n`` line ends
-    """
-
-    path: Path
-    data: dict[str, Any]
-    keys: dict[KeyPath, int]
-    values: dict[KeyPath, int]
-    text: str
-
-    def place(self, path: KeyPath, of_key: bool = False) -> tuple[int, int]:
-        """Line and column (1-based characters) of the value (or key) at ``path``; of its nearest ancestor if absent."""
-        known = self.values | self.keys if of_key else self.keys | self.values
-        ancestors = (path[:length] for length in range(len(path), 0, -1))
-        return _line_and_column(self.text, next((known[one] for one in ancestors if one in known), 0))
-
-
-def parse_toml(text: str, path: Path) -> TomlDocument:
+def parse_toml(text: str, path: Path) -> "TomlDocument":
     """Parse ``text`` (line ends ``\\n``) and locate every key and value.
 
     Raises
@@ -135,9 +110,7 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
         return value
 
     try:
-        data = tomllib.loads(text, parse_float=number)
-        scanner = _Scanner(text)
-        scanner.scan()
+        document = TomlDocument(path, text, tomllib.loads(text, parse_float=number))
     except RecursionError:
         raise InputError("nesting must be shallow", "too many brackets", _SHALLOW, path, 1, 1) from None
     except InputError:
@@ -149,16 +122,16 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
         raise InputError(
             "the file must be valid TOML", message.split(" (at ")[0], "correct this line", path, line, column
         ) from None
-    deepest = max(scanner.keys, key=len, default=())
+    deepest = max(document.keys, key=len, default=())
     if len(deepest) > DEEPEST_KEY:
         raise InputError(
             "nesting must be shallow",
             f"a key of {len(deepest)} levels",
             _SHALLOW,
             path,
-            *_line_and_column(text, scanner.keys[deepest]),
+            *document.place(deepest, of_key=True),
         )
-    return TomlDocument(path, data, scanner.keys, scanner.values, text)
+    return document
 
 
 def _line_and_column(text: str, offset: int) -> tuple[int, int]:
@@ -166,13 +139,28 @@ def _line_and_column(text: str, offset: int) -> tuple[int, int]:
     return text.count("\n", 0, offset) + 1, offset - (text.rfind("\n", 0, offset) + 1) + 1
 
 
-class _Scanner:
-    """Records the places in a text that tomllib has accepted; it checks nothing."""
+class TomlDocument:
+    """A text that tomllib has accepted, with the place of each key and value; the scan for them checks nothing.
 
-    def __init__(self, text: str) -> None:
-        self.text, self.position = text, 0
+    Attributes
+    ----------
+    path : the file, as given by the user
+    text : of the file, with ``\\n`` line ends
+    data : the content as tomllib returns it
+    keys, values : offset of every key and value by key path, e.g. ("experiment", 0, "kind")
+    """
+
+    def __init__(self, path: Path, text: str, data: dict[str, Any]) -> None:
+        self.path, self.text, self.data, self.position = path, text, data, 0
         self.keys: dict[KeyPath, int] = {}
         self.values: dict[KeyPath, int] = {}
+        self.scan()
+
+    def place(self, path: KeyPath, of_key: bool = False) -> tuple[int, int]:
+        """Line and column (1-based characters) of the value (or key) at ``path``; of its nearest ancestor if absent."""
+        known = self.values | self.keys if of_key else self.keys | self.values
+        ancestors = (path[:length] for length in range(len(path), 0, -1))
+        return _line_and_column(self.text, next((known[one] for one in ancestors if one in known), 0))
 
     def skip(self, pattern: re.Pattern[str]) -> str:
         """Move behind a match of ``pattern`` and return its text, which may be empty."""

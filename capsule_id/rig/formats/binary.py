@@ -38,6 +38,7 @@ from capsule_id.rig.formats.raw import (
     refuse_large,
     require,
 )
+from capsule_id.rig.toml import is_number
 
 # arrays: Formats of named arrays: an adapter for each gives every array of real numbers with its name and unit.
 
@@ -495,16 +496,12 @@ def _lines_of_book(content: bytes, path: Path, chosen: str | None) -> tuple[list
                     name, rows = sheet.title, found
             elif hasattr(sheet, "iter_rows"):
                 first = itertools.islice(sheet.iter_rows(values_only=True), SEARCHED_ROWS)
-                others += [sheet.title] * any(_is_number(cell) for row in first for cell in row)
+                others += [sheet.title] * any(is_number(cell) for row in first for cell in row)
     width = max((k + 1 for row in rows for k, cell in enumerate(row) if cell), default=0)
     if width * len(rows) > SPREAD * MOST_CELLS:
         raise _too_many(path)
     lines = ["\t".join([*row[:width], *[""] * (width - len(row)), ""]) if any(row) else "" for row in rows]
     return lines, name, tuple(others)
-
-
-def _is_number(cell: object) -> bool:
-    return isinstance(cell, int | float) and not isinstance(cell, bool)
 
 
 def _too_many(path: Path) -> InputError:
@@ -523,7 +520,7 @@ def _rows(sheet: Any, path: Path) -> tuple[list[list[str]], bool]:
         cells += len(row) or BLANK_ROW  # the stated number of a row can lie far below the last one
         if cells > MOST_CELLS:
             raise _too_many(path)
-        real = [*map(_is_number, row)]
+        real = [*map(is_number, row)]
         numbers = numbers or any(real)
         texts = zip(row, real, strict=True)
         rows.append([repr(float(c)) if n else "" if c is None else " ".join(str(c).split()) for c, n in texts])

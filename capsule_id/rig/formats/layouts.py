@@ -21,7 +21,6 @@ from capsule_id.rig.formats.raw import (
     RawTable,
     TextFile,
     lines_of,
-    numbers_of,
     refuse_line,
     refuse_wide,
 )
@@ -29,10 +28,8 @@ from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
     Shape,
-    apart_marks,
     bare,
     cells_of,
-    decimal_mark,
     is_comment,
     is_row,
     is_stamp,
@@ -88,28 +85,19 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     headers = tuple(names for _, names in found)
     wanted = [k for k in range(width) if layout.columns is None or is_wanted(k, headers, layout.columns)]
     decimal = "." if delimiter == "," else layout.decimal
-    shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
-    words = [k for k in wanted if is_wanted(k, headers, layout.words)]
-    first_rows = (
-        texts_of(line, delimiter) for line in islice(filter(is_row, file.lines(first)), 1 + 2 * MOST_TITLES // width)
-    )
-    columns = zip(*(cells for cells in first_rows if len(cells) >= width), strict=False)
-    # The reader in C takes every mark for the decimal one.
-    quick = not numbers_of(layout.missing) and (
-        decimal is not None or not apart_marks([*columns], layout.missing, None)
-    )
-    rows = rows_of(file, shape, wanted, None, words) if quick else None
     stated = decimal is not None and layout.decimal == decimal
-    rows = rows or rows_of(file, replace(shape, decimal=decimal, stated=stated), wanted, layout.missing, words)
-    assert rows is not None, "any cell is read with a list of markers"
+    shape = Shape(first, delimiter, width, decimal, trailing, stated)
+    rows = rows_of(file, shape, wanted, layout.missing)
     lines = rows.lines
 
     def place(row: int | None, column: int) -> Place:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
         return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    texts, every = rows.words, lambda: (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
-    return Export(path, headers, width, lines, rows.column, place, file.encoding, texts, cells=every)
+    def every() -> Iterator[list[str]]:
+        return (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
+
+    return Export(path, headers, width, lines, rows.column, place, file.encoding, cells=every, marks=rows.marks)
 
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
@@ -136,38 +124,29 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
     InputError
         If there is none, or the first line with a number is no row of readings.
     """
-    lines: list[str] = []
-    begun, row = None, 0
-    for i, line in enumerate(file.lines()):
-        lines.append(line)
-        if i >= MOST_TITLES and layout.data_from_line is None:
-            break
-        if is_comment(line):
-            continue
-        if layout.data_from_line is not None:
-            if i + 1 >= layout.data_from_line and line.strip():
-                return lines
-            continue
-        cells = split_bare(line, delimiter_of(line, layout))
-        if begun is None and any(is_number(cell) for cell in cells):
-            begun, row, cells = i, i, _mapped(cells, lines, layout)
-        if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
-            if i == begun:
-                return lines
-            row = i
-            break
+    stated = layout.data_from_line
+    lines = islice(file.lines(), MOST_TITLES if stated is None else None)
+    rows = ((k, line) for k, line in enumerate(lines) if not is_comment(line))
+    if stated is not None:
+        begun = next((k for k, line in rows if k + 1 >= stated and line.strip()), None)
+    else:
+        begun = next((k for k, line in rows if any(map(is_number, _cells(line, layout)))), None)
     if begun is None:
         raise InputError(
             f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
             "none",
             "export the readings as numbers, a row in each line",
             file.path,
-            1 if layout.data_from_line is None else len(lines),
+            1 if stated is None else sum(1 for _ in file.lines()),
             1,
         )
+    head = list(islice(file.lines(), begun + 1))
+    if stated is not None or _are_readings(_mapped(head, layout), layout):
+        return head
+    row = next((k for k, line in rows if _are_readings(_cells(line, layout), layout)), begun)
     raise InputError(
         "the first line with a number must be a row of readings, or data_from_line stated",
-        shown(lines[begun].strip()),
+        shown(head[begun].strip()),
         f"state data_from_line = {row + 1}, or the line of the first reading",
         file.path,
         begun + 1,
@@ -175,9 +154,20 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
     )
 
 
-def _mapped(cells: list[str], lines: list[str], layout: Layout) -> list[str]:
+def _cells(line: str, layout: Layout) -> list[str]:
+    """The cells of a line by its own separator."""
+    return split_bare(line, delimiter_of(line, layout))
+
+
+def _are_readings(cells: list[str], layout: Layout) -> bool:
+    """Whether some of these cells are not empty, and all of those are readings."""
+    return any(cells) and all(not cell or _is_reading(cell, layout) for cell in cells)
+
+
+def _mapped(lines: list[str], layout: Layout) -> list[str]:
     """The cells of the first row with a number, the last of ``lines``, that are read as numbers; all without a map."""
     *above, row = lines
+    cells = _cells(row, layout)
     found = (_headers(line, delimiter_of(row, layout), len(cells)) for line in above)
     headers = tuple(names for names in found if names)
     wanted = [k for k in range(len(cells)) if is_wanted(k, headers, layout.columns or ())]
@@ -307,7 +297,7 @@ def read_csv(content: bytes, path: Path) -> RawTable:
         raise InputError(rule, found, "correct the row, or the header", path, line, place)
     layout = Layout(line, missing=NO_READING, decimal="." if mark == "," and width > 1 else None)
     export = read_text(content, path, layout)
-    _refuse_two_marks(file, mark)
+    _refuse_two_marks(export)
     bare_rows = _lines_without_cells(file, export.lines)
     last = [np.full(len(export.lines), np.nan)] * (width - export.width)  # every last cell is empty
     columns = (*map(export.values, range(export.width)), *last)
@@ -321,26 +311,14 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     return replace(raw.taken(np.flatnonzero(~missing)), lost=lost)
 
 
-def _refuse_two_marks(file: TextFile, delimiter: str) -> None:
+def _refuse_two_marks(export: Export) -> None:
     """Refuse a table with decimal points in one column and decimal commas in another: a mark stands in a damaged cell."""
-    if delimiter == "," or not all(any(mark in block for _, block in file.blocks(1)) for mark in (b",", b".")):
-        return
-    rows = [(number, row) for number, row in enumerate(file.lines(1), 2) if is_row(row)]
-    columns = [*zip(*(texts_of(row, delimiter) for _, row in rows), strict=True)]
-    apart = apart_marks(columns, NO_READING, None)
-    # A column that leaves open what its mark parts is asked about when it is read.
-    texts = {k: [text.replace(apart.get(k) or " ", "") for text in column] for k, column in enumerate(columns)}
-    marks = {k: decimal_mark(column, NO_READING) for k, column in texts.items() if apart.get(k, "") is not None}
-    marks = {k: mark for k, mark in marks.items() if mark}
-    for k, mark in marks.items():
+    marks = {column: mark for column, mark in export.marks.items() if mark}
+    for column, mark in marks.items():
         if mark != next(iter(marks.values())):
-            number, row = next(
-                (number, row) for text, (number, row) in zip(texts[k], rows, strict=True) if mark in text
-            )
-            place = place_of_cell(row, delimiter, k)
-            raise InputError(
-                "a cell must be a number", shown(texts_of(row, delimiter)[k]), _ONE_MARK, file.path, number, place
-            )
+            assert export.cells is not None, "a text has cells"
+            row, cell = next((k, each[column]) for k, each in enumerate(export.cells()) if mark in each[column])
+            raise InputError("a cell must be a number", shown(cell), _ONE_MARK, *export.place(row, column))
 
 
 def _lines_without_cells(file: TextFile, rows: np.ndarray) -> list[int]:
@@ -487,7 +465,6 @@ def _by_cells(
         table[number] = separator.join(f'"{cell}' if is_comment(cell) else cell for cell in cells)
     file, shape = TextFile("\n".join(table).encode(), text.path), Shape(segments[0].first, separator, width, decimal)
     rows = rows_of(file, shape, range(width), missing)
-    assert rows is not None, "any cell is read with a list of markers"
 
     def column(index: int) -> np.ndarray:
         kept = np.ones(len(table), dtype=bool)

@@ -341,7 +341,7 @@ class Layout:
         a column map adds ``NO_READING``
     decimal : decimal mark of a text table, "." or "," (None: found in the file)
     columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
-    words : headers, or numbers counted from 1, of those whose texts it keeps too
+    words : headers, or numbers counted from 1, of those whose cells are texts
     sheet : name of the sheet of a workbook (None: the first one with numbers)
     split_by : header, or number, of the column each text of which is an experiment
     """
@@ -370,9 +370,9 @@ class Export:
         missing marker; it raises ``InputError`` at the first other cell
     place : (row index or None for the header, column index) -> where the cell stands
     encoding : of a text
-    words : index of a column that ``Layout.words`` names -> (rows,) its texts; None: the format has no texts
     sheet, others : names of the sheet of a workbook that was read, "" of another format, and of others with numbers
     cells : the texts of each row of a text or a sheet, read or not; None: the format has no such rows
+    marks : decimal marks of the columns of a text, where their numbers show them
     """
 
     path: Path
@@ -382,10 +382,10 @@ class Export:
     values: Callable[[int], np.ndarray]
     place: Callable[[int | None, int], Place]
     encoding: str = "UTF-8"
-    words: Callable[[int], np.ndarray] | None = None
     sheet: str = ""
     others: tuple[str, ...] = ()
     cells: Callable[[], Iterable[list[str]]] | None = None
+    marks: Mapping[int, str | None] = field(default_factory=dict)
 
 
 # arrays: Makes an export of named arrays: the form of every format without lines.

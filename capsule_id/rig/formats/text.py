@@ -4,10 +4,9 @@ import io
 import json
 import math
 import re
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
 
@@ -125,7 +124,7 @@ def mark_apart(written: str) -> Iterator[str]:
 
 def read_column(
     texts: Sequence[str],
-    decimal: str | None,
+    mark: str,
     missing: Sequence[str],
     place: Callable[[int], Place],
 ) -> np.ndarray:
@@ -134,7 +133,7 @@ def read_column(
     Parameters
     ----------
     texts : the cells
-    decimal : decimal mark (None: the first point or comma of the column)
+    mark : decimal mark
     missing : texts of cells without a reading
     place : file, line and column of a cell, for error lines
 
@@ -143,7 +142,6 @@ def read_column(
     InputError
         At the first cell that is neither a finite number nor a marker.
     """
-    mark = decimal or decimal_mark(texts, missing) or "."
     markers, values = frozenset(missing), np.full(len(texts), np.nan)
     all_used = markers.isdisjoint(texts)
     used = range(len(texts)) if all_used else [k for k, text in enumerate(texts) if text not in markers]
@@ -276,12 +274,12 @@ class Rows:
     ----------
     numbers : of each column that is read: those of every block
     faults : of a column, the error at its first cell that is no number
-    texts : of each column whose texts are kept
     blocks : 1-based lines of the rows of every block
+    marks : decimal mark of each column that is read; None: its numbers show none, or leave open what theirs parts
     """
 
     numbers: dict[int, list[np.ndarray]]
-    texts: dict[int, list[str]]
+    marks: dict[int, str | None]
     faults: dict[int, InputError] = field(default_factory=dict)
     blocks: list[np.ndarray] = field(default_factory=list)
 
@@ -301,10 +299,6 @@ class Rows:
         if index in self.faults:
             raise self.faults[index]
         return np.concatenate([np.empty(0), *self.numbers[index]])
-
-    def words(self, index: int) -> np.ndarray:
-        """The texts of a column, (rows,), as objects: one long text must not widen all."""
-        return np.array(self.texts[index], dtype=object)
 
 
 def is_comment(line: str) -> bool:
@@ -345,35 +339,29 @@ def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray
     return values[:, np.searchsorted(used, columns)] if exact else None
 
 
-def rows_of(
-    file: TextFile,
-    shape: Shape,
-    columns: Sequence[int],
-    missing: Sequence[str] | None = None,
-    words: Sequence[int] = (),
-) -> Rows | None:
-    """The rows of a text, with NaN at a missing marker, and the texts of the columns ``words``.
+def rows_of(file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str]) -> Rows:
+    """The rows of a text, with NaN at a missing marker.
 
-    Blocks of numbers alone are read by the reader in C. Without a list ``missing``: None for a text with any other block.
+    Blocks of numbers alone are read by the reader in C where their decimal mark is known, or no other can be meant.
 
     Raises
     ------
     InputError
         If a row has another number of cells than the first one.
     """
-    rows = Rows({column: [] for column in columns}, {column: [] for column in words})
-    markers, marks, codes = missing or (), dict.fromkeys(columns, shape.decimal), numbers_of(missing or ())
-    alone, apart = not words and not codes, None  # the reader in C would take a code for a reading
+    marks, codes = dict.fromkeys(columns, shape.decimal), numbers_of(missing)
+    rows = Rows({column: [] for column in columns}, marks)
+    apart = None
     for number, block in file.blocks(shape.first):
-        # No other decimal mark than that of the reader in C can be meant.
-        plain = alone and (shape.decimal or b"." not in block or {*marks.values()} == {"."})
-        values = plain_block(block, shape, columns) if plain else None
+        known = {mark for mark in (shape.decimal, *marks.values()) if mark}
+        # The reader in C would take a code for a reading.
+        plain = not codes and not apart and len(known) < 2 and (known or b"." not in block)
+        of_block = replace(shape, decimal=max(known, default="."))
+        values = plain_block(block, of_block, columns) if plain else None
         every = enumerate(lines_of(block) if values is None else (), number)
         kept = [(line, row) for line, row in every if is_row(row)]
         if values is None and plain and len(kept) < block.count(b"\n"):  # blank lines or comments
-            values = plain_block("\n".join([*(text for _, text in kept), ""]).encode(), shape, columns)
-        if values is None and kept and missing is None:
-            return None
+            values = plain_block("\n".join([*(text for _, text in kept), ""]).encode(), of_block, columns)
         lines = [line for line, _ in kept] if kept or values is None else np.arange(number, number + len(values))
         rows.blocks.append(np.array(lines, np.int32) + 1)
         if values is not None:
@@ -383,15 +371,12 @@ def rows_of(
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
         turned = [*zip(*cells, strict=True)] or [()] * shape.width
         if apart is None:
-            apart = apart_marks(turned, markers, shape.decimal) if shape.decimal is None or shape.stated else {}
+            apart = apart_marks(turned, missing, shape.decimal) if shape.decimal is None or shape.stated else {}
         for column in columns:
             texts = [bare(cell) for cell in turned[column]] if b'"' in block else turned[column]
             texts = [text.replace(mark, "") for text in texts] if (mark := apart.get(column, "")) else texts
-            if column in words:
-                rows.texts[column] += map(sys.intern, texts)
             if column in rows.faults:  # the first fault counts, and a later block may not show it
                 continue
-            marks[column] = marks[column] or decimal_mark(texts, markers)
 
             def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> Place:
                 line, text = kept[k]
@@ -400,7 +385,8 @@ def rows_of(
             try:
                 if mark is None:
                     raise _ambiguous(texts, turned, place)
-                found = read_column(texts, marks[column] or ".", markers, place)
+                marks[column] = marks[column] or decimal_mark(texts, missing)
+                found = read_column(texts, marks[column] or ".", missing, place)
                 rows.numbers[column].append(np.where(np.isin(found, codes), np.nan, found) if codes else found)
             except InputError as error:
                 rows.faults[column] = error
