@@ -538,15 +538,14 @@ def estimate(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[i
     nuisances = experiment.misfit(theta).design.shape[1]
     freedom = max(len(keep) - len(symbols) - nuisances, 1)
     # A model that is not finite (an overdamped decay) determines nothing.
-    finite = bool(np.isfinite(solution.jac).all())
+    jacobian = solution.jac if np.isfinite(solution.jac).all() else np.zeros_like(solution.jac)
     # In columns of unit length: a pseudo-inverse gives no variance to a parameter of little effect beside another.
-    unit = np.maximum(np.linalg.norm(solution.jac, axis=0), np.finfo(float).tiny) if finite else np.ones(len(at))
-    scaled = solution.jac / unit
-    variances = np.diag(np.linalg.pinv(scaled.T @ scaled)) / unit**2 if finite else np.full(len(at), np.inf)
+    unit = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
+    variances = np.diag(np.linalg.pinv((jacobian / unit).T @ (jacobian / unit)))
     values = values_of(solution.x)
     # Rounding may leave a variance of no positive value, where two parameters have the same effect.
-    variances = np.where(variances > 0.0, variances, np.inf)
-    errors = np.where(np.isfinite(variances), np.abs(at if signed else values), 1.0) * np.sqrt(variances)
+    sd = np.sqrt(np.where(variances > 0.0, variances, np.inf)) / unit
+    errors = np.where(np.isfinite(sd), np.abs(at if signed else values), 1.0) * sd
     return Refit(
         {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)},
         1.0 if experiment.scale_known else float(2.0 * solution.cost / freedom),

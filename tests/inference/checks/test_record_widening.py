@@ -8,6 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from capsule_id.experiments.base import refit
 from capsule_id.experiments.forced_run.drives import BaseRun
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.models import decay
@@ -225,3 +226,14 @@ def test_parts_of_noise_alone_determine_nothing(tmp_path: Path) -> None:
     found = [(values[name], pair) for e in experiments for name, pair in estimates_of_parts(e, values, 8)]
     assert len(found) > 8
     assert all(abs(value - truth) < 30.0 * sd for truth, (value, sd) in found)
+
+
+def test_a_parameter_without_effect_has_no_estimate(tmp_path: Path) -> None:
+    """Of c = 1e-300 N s/m the readings hold nothing: a column of zeros. (Before: 0/0, a warning in a fit's output.)"""
+    t = np.linspace(0.0, 0.3, 200)
+    columns = {"time [s]": np.round(t, 7), "x_rel [mm]": np.round(2.0 * np.cos(113.7 * t), 5)}
+    entry = Entry("free_vibration", "d", columns)
+    (experiment,) = make_experiments(make_rig(tmp_path, entry, head={"m1": quantity(0.11, "kg", 0.0005)}))
+    found = refit(experiment, {"m1": 0.11, "k1": 1422.0, "c": 1e-300, experiment.scatters[0]: 1e-5}, [])
+    assert found["c"][1] == np.inf
+    assert 0.0 < found["k1"][1] < 10.0
