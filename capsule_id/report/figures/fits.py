@@ -403,9 +403,16 @@ def phase_plane(view: MotionView, ax: Axes) -> None:
 
 
 def force_on_rod(record: RunRecord, ax: Axes) -> None:
-    """K times the recorded current against time, and beside it the fitted drive."""
+    """K times the recorded current against time, and beside it the fitted drive.
+
+    Raises
+    ------
+    ValueError
+        If the view has no force: it was made without K, or from a table without current.
+    """
     view = record.view
-    assert view.force is not None, "view_record had a K and a table with current"
+    if view.force is None:
+        raise ValueError("this view has no force: give view_record a K and a table with current")
     ax.plot(view.time, view.force, color=PURPLE, lw=1.0, label="K times current")
     ax.plot(view.time, record.force, color=BLACK, ls="--", lw=1.2, label="model")
     set_text(ax, "time, s", "force on the rod, N", f"motion: {view.label}")
