@@ -103,6 +103,7 @@ class Number:
     shared : further ones, those of all relations of its kind
     label : of its experiment
     unit, to_display : as written; "" for ``si``
+    code : of the finding
     """
 
     name: str
@@ -113,6 +114,7 @@ class Number:
     label: str = ""
     unit: str = ""
     to_display: float = 1.0
+    code: str = "readings.magnitude"
     shared: tuple[str, ...] = ()
 
     def unusual(self, rig: Rig) -> Iterable[Finding]:
@@ -131,7 +133,7 @@ class Number:
             # The likeliest unit in which the written number would be usual.
             "meant": next((unit for unit in units if low <= written * factor_to_si(unit, self.si) <= high), ""),
         }
-        yield Finding("readings.magnitude", "warn", facts, self.label)
+        yield Finding(self.code, "warn", facts, self.label)
 
 
 def lint_rig_quantities(rig: Rig) -> Iterable[Finding]:
