@@ -17,6 +17,8 @@ TURN = 0.12
 LEG = 0.3
 #: The part of a leg whose steepest place gives the period, and the time that a cosine takes for it, in periods.
 STEEP, STEEP_TIME = 0.3, 0.097
+#: Fewer different readings behind a release are levels of a rounded tail.
+FEWEST_LEVELS = 4
 #: Where the leg has passed this fraction of its height, the release is past.
 PAST = 0.8
 #: Samples in a period that suffice; of more, means are taken. Fewest in a window.
@@ -100,7 +102,10 @@ def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = F
     whole, (time, values) = time, shortened(time, values)
     if len(time) < len(whole):
         time[[0, -1]] = whole[[0, -1]]
-    return _find(*(np.asarray(a, float).tobytes() for a in (time, values)), displacement)
+    found = _find(*(np.asarray(a, float).tobytes() for a in (time, values)), displacement)
+    if found is not None and len(np.unique(values[time >= found.start])) < FEWEST_LEVELS:
+        found = replace(found, start=float(time[0]), rest=0.0)  # coarse levels of a tail at rest are no release
+    return found
 
 
 def find_releases(time: np.ndarray, values: np.ndarray, displacement: bool = False) -> list[slice]:
