@@ -412,6 +412,7 @@ QUESTIONS: Mapping[str, str] = {
     "decays.halves": "Do both halves of the record agree? {name}: {z:.2g} sd apart, limit 4 (a warning above 3).",
     "decays.hidden": "Do the records exclude further forces?",
     "decays.held": "Is the instant of the release known?",
+    "decays.onset": "Does the first half period change the numbers? {p:p}, limit 0.002 over all records.",
     "decays.stiffness": "Is k1 the same at all amplitudes? {p:p}, limit 0.002.",
     "decays.position": "Do the residuals depend on the position? {p:p}, limit 0.002 over all records.",
     "decays.residuals": "Do the residuals grow with the amplitude? {p:p}, limit 0.002 over all records.",

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 import capsule_id as cid
 from capsule_id import cli
 from capsule_id.experiments.base import refit
-from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_found_forces
+from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_found_forces, onset
 from capsule_id.experiments.free_vibration.lint import MESSAGES, lint_decay
 from capsule_id.experiments.free_vibration.models import decay
-from capsule_id.experiments.free_vibration.readings import DecayModel
+from capsule_id.experiments.free_vibration.readings import DecayModel, cut_at_release
 from capsule_id.experiments.free_vibration.record import Screened
 from capsule_id.experiments.free_vibration.screening import Screening, hum_of
 from capsule_id.experiments.free_vibration.second_fit import (
@@ -296,3 +297,38 @@ def test_hum_and_a_further_force_are_found_together_and_stated_hum_is_kept() -> 
     stated = humming(hum=50.0)
     assert stated.model.hum == 50.0
     assert second_models([stated]) == ([stated], [])
+
+
+def _released(ramp: float, cubic: float) -> FreeVibration:
+    """A decay of ratio 0.25 from a rest of a period: the force ends within ``ramp`` periods; k_cubic A^2 over k1."""
+    period, size, ratio = 1.0 / 6.0, 2e-3, 0.25
+    omega, time = 2.0 * np.pi / period, np.arange(400) / 400.0
+    force = omega**2 * (size + cubic * size) * np.clip(1.0 - (time - period) / (ramp * period), 0.0, 1.0)
+
+    def rates(t: float, s: np.ndarray) -> list[float]:
+        spring = s[0] + cubic * s[0] ** 3 / size**2
+        return [s[1], np.interp(t, time, force) - omega**2 * spring - 2.0 * ratio * omega * s[1]]
+
+    x = solve_ivp(rates, (0.0, time[-1]), [size, 0.0], t_eval=time, rtol=1e-9, atol=1e-12, max_step=2e-3).y[0]
+    x += 8e-6 * np.random.default_rng(28).standard_normal(len(time))
+    table = bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)], "decay")
+    return FreeVibration(cut_at_release(table), bench.rig(table)).with_model(DecayModel(cubic=True))
+
+
+def test_a_slow_release_is_told_from_a_further_force() -> None:
+    """Before: k_cubic = -53.5 ± 0.6 MN/m^3 trusted, of a linear rod whose holding force took 0.4 periods to end.
+
+    Control: a cubic spring that is there, released at once.
+    """
+    judged = {}
+    for ramp, cubic in ((0.4, 0.0), (1e-3, -0.15)):
+        e = _released(ramp, cubic)
+        values = Screening(e).fit(e.model)[0].values
+        theta = {**values, **{row.name: values[row.symbol] for row in e.parameters if row.symbol in values}}
+        found = onset(e, theta | {e.scatters[0]: 8e-6})
+        assert found is not None
+        judged[cubic] = found
+        assert abs(values["k_cubic"]) > 0.05 * values["k1"] / 2e-3**2
+    assert judged[0.0][1] < 1e-6
+    assert judged[0.0][0]["start"] > 1.4 / 6.0
+    assert judged[-0.15][1] > 0.01

@@ -285,6 +285,53 @@ def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | Non
     return {"p": p, "low": float(low), "high": float(high), "unit": e.column.unit, **later_start(e)}, p
 
 
+def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float, float] | None:
+    """Compare a decay with further forces with its readings after the first half period, which a release shapes.
+
+    Return facts, the p-value of equal parameters, and the smallest force there, in sds. By one linear step from the fit: dry
+    friction has many maxima, and a fit of the later readings may end at another one.
+    """
+    if not e.model.symbols or (e.order == 2 and "dry" in e.model.damping):
+        return None
+    left, design, moved = sensitivities(e, theta)
+    later = e.time > e.time[0] + float(np.pi / e.rough.Omega_o)
+    known = np.asarray(e.whitened(theta, np.column_stack([left, *moved.values(), design])))
+    freedom = np.count_nonzero(later) - known.shape[1] + 1
+    if freedom < SHORTEST:
+        return None
+    unit = np.maximum(np.linalg.norm(known[:, 1:], axis=0), np.finfo(float).tiny)
+    step, part = (np.linalg.lstsq(rows[:, 1:] / unit, -rows[:, 0], rcond=None)[0] for rows in (known, known[later]))
+    scaled = known[later, 1:] / unit
+    noise = float(np.sum((known[later, 0] + scaled @ part) ** 2)) / freedom
+    names = [name for name in moved if name in ("k1", "c", *e.model.symbols)]
+    at = [list(moved).index(name) for name in names]
+    covariance = noise * np.linalg.pinv(scaled.T @ scaled)[np.ix_(at, at)]
+    change, sd = (part - step)[at], np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    # Too large a covariance: all readings hold the later ones.
+    p = float(stats.chi2.sf(change @ np.linalg.pinv(covariance) @ change, len(names)))
+    values = {name: theta[name] + float(change[i] / unit[at[i]]) for i, name in enumerate(names)}
+    sizes = {name: abs(values[name]) * unit[at[i]] / sd[i] for i, name in enumerate(names)}
+    name, start = (
+        names[int(np.argmax(np.abs(change) / sd))],
+        float(decay_window(e.table)[0][0] + np.pi / e.rough.Omega_o),
+    )
+    facts = {"label": e.label, "name": name, "whole": theta[name], "later": values[name], "unit": parameter(name).unit}
+    return {**facts, "p": p, "start": start}, p, min(sizes[symbol] for symbol in e.model.symbols)
+
+
+def check_onset(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
+    """Check that further forces do not stem from the first half period; those that no setting states must be seen later."""
+    judged = [(e, *found) for e in records if (found := onset(e, e.local(fit.values))) is not None]
+    findings = list[Finding]()
+    for e, facts, p, size in judged:
+        if p * len(judged) < LEVEL:
+            findings.append(Finding("decays.onset", "fail", facts, e.label))
+        elif e.replaced and size < VISIBLE:
+            findings.append(Finding("decays.onset", "warn", facts, e.label, ("k1", "c", *e.model.symbols)))
+    labels = ", ".join(e.label for e, *_ in judged)
+    return findings or [Finding("decays.onset", "ok", {"labels": labels})] * bool(judged)
+
+
 def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> dict[str, tuple[float, float]]:
     """Estimate and standard error of each physical parameter from one half, from the values ``theta`` of the whole."""
     if half.closed and not half.model.whitened:
@@ -342,6 +389,7 @@ class FreeVibration(DecayRecord):
         check_stiffness,
         check_free_decay,
         check_halves,
+        check_onset,
         check_aliases,
         check_positions,
         each("decays.residuals", size_of_residuals),

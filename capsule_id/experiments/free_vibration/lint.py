@@ -219,7 +219,7 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
         yield Finding("decays.alias", "fail" if certain else "warn", facts, table.label, () if certain else ("k1",))
     elif possible.any() and (per_period < SAMPLES_WITHOUT_ALIAS or length_of_motion(values) < SAMPLES_OF_MOTION):
         other = (
-            ": even samples have aliases, and the prior of k1 holds one. Or state what is known of k1, such as "
+            ": even samples have aliases, and the prior of k1 holds one. Or state what other measurements tell of k1, such as "
             f'k1 = {{ median = {k1:.2g}, factor = {PROPOSED_FACTOR}, unit = "N/m" }} in [prior]'
         )
         facts = {"samples": per_period, "wanted": 1.0 + np.sqrt(high / k1), "other": other}
@@ -518,6 +518,10 @@ _HELD = (
 )
 _FREE = "If the rod is free from the first reading of the fit on, add this line to the experiment in rig.toml: "
 _FREE += line_of("start")
+_SLOW = (
+    "A slow release, or a hand that still touches the rod, looks like a further force. Add this line to the experiment in "
+    "rig.toml, with the time from which on the rod is free: " + line_of("start")
+)
 
 MESSAGES = {
     **LINT_MESSAGES,
@@ -533,6 +537,19 @@ MESSAGES = {
         ok="{labels}: k1 and c do not depend on the instant of the release",
         warn=_HELD + " The quoted interval holds that. " + _FREE,
         fail=_HELD + " " + _FREE,
+    ),
+    "decays.onset": Message(
+        "first half period of a decay",
+        ok="{labels}: the readings after the first half period give the same parameters",
+        warn=(
+            "{label}: the readings after the first half period do not show the further force that the second fit found. "
+            + _SLOW
+            + ". If the rod was free at once, state the words of damping and stiffness that the second fit names."
+        ),
+        fail=(
+            "{label}: expected the same {name} without the first half period; all readings give {whole:.4g}, the later ones "
+            "{later:.4g} {unit} ({p:p} for all parameters). " + _SLOW
+        ),
     ),
     "decays.stiffness": Message(
         "stiffness against amplitude",
