@@ -158,7 +158,7 @@ EDITS: list[tuple[str, Callable[[Folder, str, re.Match[str]], None]]] = [
     (r"Check the unit of ([\w.]+)\. If the (?:times are|number is) in (\w+), write that unit", _unit),
     (rf"(reject = {_QUANTITY})", lambda folder, text, found: _add(folder, found[1])),
     (rf"((?:start|stop) = {_QUANTITY})", lambda folder, text, found: _add(folder, found[1])),
-    (rf"Or state what other measurements tell of k1, such as (k1 = {_QUANTITY}) in \[prior\]", _prior),
+    (rf"Or, where another measurement gives about this k1, write (k1 = {_QUANTITY}) in \[prior\]", _prior),
     (r"Delete its row", _row),
 ]
 

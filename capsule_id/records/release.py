@@ -103,8 +103,12 @@ def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = F
     if len(time) < len(whole):
         time[[0, -1]] = whole[[0, -1]]
     found = _find(*(np.asarray(a, float).tobytes() for a in (time, values)), displacement)
-    if found is not None and len(np.unique(values[time >= found.start])) < FEWEST_LEVELS:
-        found = replace(found, start=float(time[0]), rest=0.0)  # coarse levels of a tail at rest are no release
+    if found is None:
+        return None
+    first = int(np.searchsorted(time, found.start))
+    if first and len(np.unique(values[first:])) < FEWEST_LEVELS:  # a tail at rest: the release lies before it
+        before = find_free_decay(time[:first], values[:first], displacement)
+        return replace(before or replace(found, start=float(time[0]), rest=0.0), stop=None)
     return found
 
 
@@ -260,7 +264,9 @@ def _turning_points(values: np.ndarray) -> np.ndarray:
 
 def _scale(time: np.ndarray, values: np.ndarray, begin: int, end: int) -> tuple[float, float]:
     """Period of the oscillation to a factor of two, from the steepest part of a leg, and a time behind its release."""
-    passed = np.maximum.accumulate((values[begin : end + 1] - values[begin]) / (values[end] - values[begin]))
+    rise = values[begin : end + 1] - values[begin]
+    # Of coarse readings both ends may be equal.
+    passed = np.maximum.accumulate(rise / (rise[-1] or rise[np.argmax(np.abs(rise))] or 1.0))
     levels = np.linspace(0.0, 1.0, 41)
     place = np.clip(np.searchsorted(passed, levels), 1, len(passed) - 1)
     low, high = passed[place - 1], passed[place]
@@ -436,7 +442,8 @@ def _whole(
     """
     end = record.end(begin)
     time, values, half = record.time[:end] - record.time[0], record.values[:end], float(np.median(lengths))
-    if len(lengths) < LEGS or 2.0 * half < WHOLE * float(np.max(np.diff(time))) or record.noise == 0.0:
+    coarse = 2.0 * half < WHOLE * float(np.max(np.diff(time))) or np.min(sizes) == 0.0
+    if len(lengths) < LEGS or coarse or record.noise == 0.0:
         return None
     loss = float(np.log(sizes[1] / sizes[-1])) / max(len(sizes) - 2, 1)
     omega, zeta = np.pi / half, float(np.clip(loss / np.hypot(np.pi, loss), 0.001, OSCILLATES))

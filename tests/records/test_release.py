@@ -236,7 +236,9 @@ def test_a_column_costs_one_wave_of_two_conjugate_ones(zeta: float, poles: int) 
         np.testing.assert_allclose(left, 0.0, atol=5e-3)
 
 
-@pytest.mark.parametrize(("ratio", "step", "samples"), [(0.4, 0.1, 8), (0.6, 0.02, 5), (0.8, 0.05, 20), (1.5, 0.1, 12)])
+@pytest.mark.parametrize(
+    ("ratio", "step", "samples"), [(0.4, 0.1, 8), (0.4, 0.05, 3), (0.6, 0.02, 5), (0.8, 0.05, 20), (1.5, 0.1, 12)]
+)
 def test_levels_of_a_rounded_tail_are_no_release(ratio: float, step: float, samples: int) -> None:
     """Before: the cut left one level alone, and a fit ended in ZeroDivisionError."""
     time = np.arange(5 * samples) / samples
@@ -245,6 +247,90 @@ def test_levels_of_a_rounded_tail_are_no_release(ratio: float, step: float, samp
     values = step * np.round(x / step)
     found = find_free_decay(time, values, displacement=True)
     assert found is None or len(np.unique(values[time >= found.start])) >= release.FEWEST_LEVELS
-    held = np.concatenate([np.full(30, 1.0), values])  # control: a hold before the release is cut off
-    later = find_free_decay(np.arange(len(held)) / samples, held, displacement=True)
-    assert later is None or later.rest == 0.0 or 25 <= later.start * samples <= 32
+    if step == 0.1 and samples == 8:  # control: a hold before the release is cut off
+        held = np.concatenate([np.full(30, 1.0), values])
+        later = find_free_decay(np.arange(len(held)) / samples, held, displacement=True)
+        assert later is not None
+        assert 29 <= later.start * samples <= 31
+
+
+def test_legs_between_equal_coarse_readings_are_no_estimate_of_the_damping() -> None:
+    """A hold, one swing and noise of a level or two. (Before: the logarithm of 0, a warning in the user's output.)"""
+    release_of = [
+        10,
+        10,
+        9,
+        10,
+        10,
+        10,
+        10,
+        10,
+        10,
+        9,
+        7,
+        4,
+        1,
+        1,
+        0,
+        0,
+        -1,
+        1,
+        1,
+        -1,
+        0,
+        0,
+        0,
+        -1,
+        0,
+        0,
+        0,
+        0,
+        0,
+        -1,
+        1,
+        -1,
+    ]
+    tail = [
+        0,
+        1,
+        0,
+        0,
+        0,
+        1,
+        0,
+        0,
+        0,
+        1,
+        1,
+        -1,
+        0,
+        1,
+        0,
+        0,
+        0,
+        0,
+        -1,
+        -1,
+        0,
+        -2,
+        -1,
+        1,
+        0,
+        0,
+        -1,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+        -1,
+    ]
+    tail += [0, 0, 0, 1, 1, 0, 0, 0, -1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0]
+    values = 0.1 * np.array([*release_of, *tail], dtype=float)
+    found = find_free_decay(np.arange(len(values)) / 11.0, values, displacement=True)
+    assert found is not None
+    assert found.start <= 11 / 11.0

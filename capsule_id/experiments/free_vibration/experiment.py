@@ -294,10 +294,11 @@ def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float, float] |
     if not e.model.symbols or (e.order == 2 and "dry" in e.model.damping):
         return None
     left, design, moved = sensitivities(e, theta)
-    later = e.time > e.time[0] + float(np.pi / e.rough.Omega_o)
+    half = float(np.pi / e.rough.Omega_o)
+    later = e.time > e.time[0] + half
     known = np.asarray(e.whitened(theta, np.column_stack([left, *moved.values(), design])))
     freedom = np.count_nonzero(later) - known.shape[1] + 1
-    if freedom < SHORTEST:
+    if freedom < SHORTEST or not np.isfinite(known).all():
         return None
     unit = np.maximum(np.linalg.norm(known[:, 1:], axis=0), np.finfo(float).tiny)
     step, part = (np.linalg.lstsq(rows[:, 1:] / unit, -rows[:, 0], rcond=None)[0] for rows in (known, known[later]))
@@ -307,16 +308,14 @@ def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float, float] |
     at = [list(moved).index(name) for name in names]
     covariance = noise * np.linalg.pinv(scaled.T @ scaled)[np.ix_(at, at)]
     change, sd = (part - step)[at], np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-    # Too large a covariance: all readings hold the later ones.
+    # The estimate from all readings shares the later ones, so the covariance of the change is at most this one.
     p = float(stats.chi2.sf(change @ np.linalg.pinv(covariance) @ change, len(names)))
     values = {name: theta[name] + float(change[i] / unit[at[i]]) for i, name in enumerate(names)}
     sizes = {name: abs(values[name]) * unit[at[i]] / sd[i] for i, name in enumerate(names)}
-    name, start = (
-        names[int(np.argmax(np.abs(change) / sd))],
-        float(decay_window(e.table)[0][0] + np.pi / e.rough.Omega_o),
-    )
+    name = names[int(np.argmax(np.abs(change) / sd))]
     facts = {"label": e.label, "name": name, "whole": theta[name], "later": values[name], "unit": parameter(name).unit}
-    return {**facts, "p": p, "start": start}, p, min(sizes[symbol] for symbol in e.model.symbols)
+    facts |= {"p": p, "start": float(decay_window(e.table)[0][0]) + half}
+    return facts, p, min(sizes[symbol] for symbol in e.model.symbols)
 
 
 def check_onset(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:

@@ -219,8 +219,8 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
         yield Finding("decays.alias", "fail" if certain else "warn", facts, table.label, () if certain else ("k1",))
     elif possible.any() and (per_period < SAMPLES_WITHOUT_ALIAS or length_of_motion(values) < SAMPLES_OF_MOTION):
         other = (
-            ": even samples have aliases, and the prior of k1 holds one. Or state what other measurements tell of k1, such as "
-            f'k1 = {{ median = {k1:.2g}, factor = {PROPOSED_FACTOR}, unit = "N/m" }} in [prior]'
+            ": even samples have aliases, and the prior of k1 includes one. Or, where another measurement gives about this k1, "
+            f'write k1 = {{ median = {k1:.2g}, factor = {PROPOSED_FACTOR}, unit = "N/m" }} in [prior]'
         )
         facts = {"samples": per_period, "wanted": 1.0 + np.sqrt(high / k1), "other": other}
         yield Finding("decays.sampling", "warn", facts, table.label, ("k1",))
