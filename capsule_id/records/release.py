@@ -103,12 +103,9 @@ def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = F
     if len(time) < len(whole):
         time[[0, -1]] = whole[[0, -1]]
     found = _find(*(np.asarray(a, float).tobytes() for a in (time, values)), displacement)
-    if found is None:
-        return None
-    first = int(np.searchsorted(time, found.start))
+    first = 0 if found is None else int(np.searchsorted(time, found.start))
     if first and len(np.unique(values[first:])) < FEWEST_LEVELS:  # a tail at rest: the release lies before it
-        before = find_free_decay(time[:first], values[:first], displacement)
-        return replace(before or replace(found, start=float(time[0]), rest=0.0), stop=None)
+        return find_free_decay(time[:first], values[:first], displacement)
     return found
 
 

@@ -4,7 +4,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,7 +15,8 @@ from scipy.signal import lfilter
 import capsule_id as cid
 from capsule_id import cli
 from capsule_id.experiments.base import refit
-from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_found_forces, onset
+from capsule_id.experiments.free_vibration import experiment
+from capsule_id.experiments.free_vibration.experiment import FreeVibration, check_found_forces, check_onset, onset
 from capsule_id.experiments.free_vibration.lint import MESSAGES, lint_decay
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.experiments.free_vibration.readings import DecayModel, cut_at_release
@@ -325,10 +326,43 @@ def test_a_slow_release_is_told_from_a_further_force() -> None:
         e = _released(ramp, cubic)
         values = Screening(e).fit(e.model)[0].values
         theta = {**values, **{row.name: values[row.symbol] for row in e.parameters if row.symbol in values}}
-        found = onset(e, theta | {e.scatters[0]: 8e-6})
-        assert found is not None
-        judged[cubic] = found
+        theta[e.scatters[0]] = 8e-6
+        judged[cubic] = cast(tuple, onset(e, theta))
+        # Beside the optimum, as in a fit of several records, the change is the same.
+        beside = cast(tuple, onset(e, theta | {"k1": (1.0 + 1e-3) * theta["k1"]}))
+        assert np.log(beside[1]) == pytest.approx(np.log(judged[cubic][1]), rel=0.2)
         assert abs(values["k_cubic"]) > 0.05 * values["k1"] / 2e-3**2
     assert judged[0.0][1] < 1e-6
     assert judged[0.0][0]["start"] > 1.4 / 6.0
     assert judged[-0.15][1] > 0.01
+
+
+@pytest.mark.parametrize(
+    ("found", "replaced", "p", "size", "level", "doubtful"),
+    [
+        (True, True, 1e-9, 50.0, "fail", ()),
+        (True, False, 1e-9, 50.0, "fail", ()),
+        (True, True, 0.5, 1.0, "warn", ("k1", "c", "k_cubic")),
+        (True, False, 0.5, 1.0, "ok", ()),
+        (True, True, 0.5, 50.0, "ok", ()),
+        (False, True, 0.5, 50.0, "", ()),
+    ],
+)
+def test_a_force_that_later_readings_lack_is_doubted_unless_stated(
+    monkeypatch: pytest.MonkeyPatch,
+    found: bool,
+    replaced: bool,
+    p: float,
+    size: float,
+    level: str,
+    doubtful: tuple[str, ...],
+) -> None:
+    facts = {"label": "d", "name": "k1", "whole": 295.7, "later": 286.4, "unit": "N/m", "p": p, "start": 0.27}
+    monkeypatch.setattr(experiment, "onset", lambda e, theta: (facts, p, size) if found else None)
+    model = SimpleNamespace(symbols=("k_cubic",))
+    record: Any = SimpleNamespace(label="d", local=dict, replaced=replaced, model=model)
+    findings = check_onset([record], cast(Any, SimpleNamespace(values={})))
+    assert [one.level for one in findings] == [level] * bool(level)
+    assert [one.parameters for one in findings] == [doubtful] * bool(level)
+    for one in findings:
+        assert ("start = {" in MESSAGES[one.code].text(one.level, one.facts)) == (level != "ok")

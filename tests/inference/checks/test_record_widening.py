@@ -7,6 +7,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+from scipy.optimize import curve_fit
 
 from capsule_id.experiments.base import refit
 from capsule_id.experiments.forced_run.drives import BaseRun
@@ -236,4 +237,12 @@ def test_a_parameter_without_effect_has_no_estimate(tmp_path: Path) -> None:
     (experiment,) = make_experiments(make_rig(tmp_path, entry, head={"m1": quantity(0.11, "kg", 0.0005)}))
     found = refit(experiment, {"m1": 0.11, "k1": 1422.0, "c": 1e-300, experiment.scatters[0]: 1e-5}, [])
     assert found["c"][1] == np.inf
-    assert 0.0 < found["k1"][1] < 10.0
+    x, t = experiment.values, experiment.time
+
+    def cosine(t: np.ndarray, k1: float, a: float, b: float, offset: float) -> np.ndarray:
+        angle = np.sqrt(k1 / 0.11) * t
+        return a * np.cos(angle) + b * np.sin(angle) + offset
+
+    best, covariance = curve_fit(cosine, t, x, [1422.0, 2e-3, 0.0, 0.0])
+    assert found["k1"][0] == pytest.approx(best[0], rel=1e-6)
+    assert found["k1"][1] == pytest.approx(np.sqrt(covariance[0, 0]), rel=0.02)
