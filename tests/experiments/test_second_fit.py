@@ -332,6 +332,11 @@ def test_a_slow_release_is_told_from_a_further_force() -> None:
         beside = cast(tuple, onset(e, theta | {"k1": (1.0 + 1e-3) * theta["k1"]}))
         assert np.log(beside[1]) == pytest.approx(np.log(judged[cubic][1]), rel=0.2)
         assert abs(values["k_cubic"]) > 0.05 * values["k1"] / 2e-3**2
+        # The size of the force there is that of a fit of the later readings, in its sds.
+        half = float(np.pi / e.rough.Omega_o)
+        later = Screening(e.between(half, float(e.time[-1]))).fit(e.model, Screening(e).scaled(values))[0]
+        size = abs(later.values["k_cubic"]) / later.errors["k_cubic"]
+        assert judged[cubic][2] == pytest.approx(size, rel=0.5)
     assert judged[0.0][1] < 1e-6
     assert judged[0.0][0]["start"] > 1.4 / 6.0
     assert judged[-0.15][1] > 0.01
