@@ -256,81 +256,12 @@ def test_levels_of_a_rounded_tail_are_no_release(ratio: float, step: float, samp
 
 def test_legs_between_equal_coarse_readings_are_no_estimate_of_the_damping() -> None:
     """A hold, one swing and noise of a level or two. (Before: the logarithm of 0, a warning in the user's output.)"""
-    release_of = [
-        10,
-        10,
-        9,
-        10,
-        10,
-        10,
-        10,
-        10,
-        10,
-        9,
-        7,
-        4,
-        1,
-        1,
-        0,
-        0,
-        -1,
-        1,
-        1,
-        -1,
-        0,
-        0,
-        0,
-        -1,
-        0,
-        0,
-        0,
-        0,
-        0,
-        -1,
-        1,
-        -1,
-    ]
-    tail = [
-        0,
-        1,
-        0,
-        0,
-        0,
-        1,
-        0,
-        0,
-        0,
-        1,
-        1,
-        -1,
-        0,
-        1,
-        0,
-        0,
-        0,
-        0,
-        -1,
-        -1,
-        0,
-        -2,
-        -1,
-        1,
-        0,
-        0,
-        -1,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        -1,
-    ]
-    tail += [0, 0, 0, 1, 1, 0, 0, 0, -1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0]
-    values = 0.1 * np.array([*release_of, *tail], dtype=float)
+    levels = (
+        "10 10 9 10 10 10 10 10 10 9 7 4 1 1 0 0 -1 1 1 -1 0 0 0 -1 0 0 0 0 0 -1 1 -1 0 1 0 0 0 1 0 0 0 1 1 "
+        "-1 0 1 0 0 0 0 -1 -1 0 -2 -1 1 0 0 -1 0 0 0 0 0 0 0 0 0 -1 0 0 0 1 1 0 0 0 -1 1 0 0 0 0 0 0 0 0 0 1 "
+        "0"
+    )
+    values = 0.1 * np.array(levels.split(), dtype=float)
     found = find_free_decay(np.arange(len(values)) / 11.0, values, displacement=True)
     assert found is not None
     assert found.start <= 11 / 11.0
