@@ -84,8 +84,8 @@ TOLERANCE, MAXIMUM = 1e-4, 1e-3
 GRADIENT_STEP = 2e-2
 #: Largest number of parameters along each of which differences are taken: their time grows with its square.
 MANY = 100
-#: Largest number of quasi-Newton steps.
-MAX_STEPS = 400
+#: Largest number of quasi-Newton steps, and the times that the curvature is taken anew on the way to the best maximum.
+MAX_STEPS, ROUNDS = 400, 4
 #: Replaces a term of the log-posterior that is not finite, because line searches need a finite number.
 LOG_POSTERIOR_FLOOR = -1e12
 #: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
@@ -151,21 +151,24 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     before, after = density(starts), density(ends)
     ends = np.where((after >= before)[:, None], ends, starts)
     best = int(np.argmax(np.nan_to_num(np.fmax(before, after), nan=-np.inf)))
-    roots = root_of_covariance(target, ends[best], linearised(target, ends[best])[1])
+    at = ends[best]
     # Every batch runs in the pool of threads, so the starts need their own.
     with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
         # SciPy hides this warning itself, but its way is not safe in threads.
         warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
-        highest = polish(target, ends[best], roots)
-        if not highest[2]:
-            # The best end of least squares may lie far from the maximum, where the curvature is another one.
-            roots = root_of_covariance(target, highest[0], linearised(target, highest[0])[1])
-            highest = polish(target, highest[0], roots)
+        # The best end of least squares may lie far from the maximum, where the curvature is another one.
+        for _ in range(ROUNDS):
+            roots = root_of_covariance(target, at, linearised(target, at)[1])
+            at, _, converged = highest = polish(target, at, roots, MAX_STEPS // ROUNDS)
+            if converged:
+                break
         # An end of least squares within a fraction of a standard deviation leads to the same maximum.
         spread = np.sqrt(np.sum(np.matmul(*roots) ** 2, axis=1))
         away = np.any(np.abs(ends - highest[0])[:, located] > SAME_BASIN * spread[located], axis=1)
         away[best] = False
-        others = list(threads.map(lambda end: polish(target, end, roots), ends[away]))
+        # Where the best end stalls, the others would too, and the check of the starts fails in any case.
+        steps = MAX_STEPS if highest[2] else MAX_STEPS // ROUNDS
+        others = list(threads.map(lambda end: polish(target, end, roots, steps), ends[away]))
     polished = [others.pop(0) if own else highest for own in away]
     u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     return u, value, converged
@@ -184,7 +187,9 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
     return centre + spread * z
 
 
-def polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> tuple[Vector, float, bool]:
+def polish(
+    target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix], steps: int = MAX_STEPS
+) -> tuple[Vector, float, bool]:
     """BFGS from ``end`` (d,) in coordinates whitened by ``roots``: maximum (d,), log-posterior there, converged.
 
     Roots (d, k) search k directions only, k < d.
@@ -196,20 +201,20 @@ def polish(target: LogPosterior, end: Vector, roots: tuple[Matrix, Matrix]) -> t
     d = whitening.shape[1]
     if d <= MANY or d < len(end):
         whitening, rotation, alone = whitening @ rotation, np.eye(d), alone[:0]
-    rest, steps = np.setdiff1d(np.arange(d), alone), GRADIENT_STEP * directions(d, alone)
+    rest, moves = np.setdiff1d(np.arange(d), alone), GRADIENT_STEP * directions(d, alone)
 
     def objective(v: Vector) -> tuple[float, Vector]:
         """Negative log-posterior at whitened v (d,), and its gradient (d,): one batch for both, up to 15 directions."""
         w = rotation @ v
-        found = terms(end + np.concatenate([w[None], w + steps, w - steps]) @ whitening.T)
+        found = terms(end + np.concatenate([w[None], w + moves, w - moves]) @ whitening.T)
         found = np.where(np.isfinite(found), found, LOG_POSTERIOR_FLOOR)
-        centre, *sides = np.split(found, [1, 1 + len(steps)])
+        centre, *sides = np.split(found, [1, 1 + len(moves)])
         slopes, gradient = (sides[0] - sides[1]) / (2.0 * GRADIENT_STEP), np.empty(d)
         gradient[rest], gradient[alone] = np.sum(slopes[: len(rest)], axis=1), slopes[len(rest) :, 1:].reshape(-1)
         return -float(np.sum(centre)), -gradient @ rotation
 
     stop_if_interrupted()
-    options = {"gtol": TOLERANCE, "maxiter": MAX_STEPS}
+    options = {"gtol": TOLERANCE, "maxiter": steps}
     # A line search may leave the domain, where slopes of the floor overflow.
     with np.errstate(over="ignore", invalid="ignore"):
         solution = optimize.minimize(objective, np.zeros(d), jac=True, method="BFGS", options=options)

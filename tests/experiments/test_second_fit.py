@@ -300,8 +300,11 @@ def test_hum_and_a_further_force_are_found_together_and_stated_hum_is_kept() -> 
     assert second_models([stated]) == ([stated], [])
 
 
-def _released(ramp: float, cubic: float) -> FreeVibration:
-    """A decay of ratio 0.25 from a rest of a period: the force ends within ``ramp`` periods; k_cubic A^2 over k1."""
+def _released(ramp: float, cubic: float, model: DecayModel, louder: float = 1.0) -> FreeVibration:
+    """A decay of ratio 0.25 from a rest of a period: the force ends within ``ramp`` periods; k_cubic A^2 over k1.
+
+    The noise of the first half period is ``louder``.
+    """
     period, size, ratio = 1.0 / 6.0, 2e-3, 0.25
     omega, time = 2.0 * np.pi / period, np.arange(400) / 400.0
     force = omega**2 * (size + cubic * size) * np.clip(1.0 - (time - period) / (ramp * period), 0.0, 1.0)
@@ -311,9 +314,10 @@ def _released(ramp: float, cubic: float) -> FreeVibration:
         return [s[1], np.interp(t, time, force) - omega**2 * spring - 2.0 * ratio * omega * s[1]]
 
     x = solve_ivp(rates, (0.0, time[-1]), [size, 0.0], t_eval=time, rtol=1e-9, atol=1e-12, max_step=2e-3).y[0]
-    x += 8e-6 * np.random.default_rng(28).standard_normal(len(time))
+    noise = 8e-6 * np.where(time < 1.5 * period, louder, 1.0)
+    x += noise * np.random.default_rng(28).standard_normal(len(time))
     table = bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)], "decay")
-    return FreeVibration(cut_at_release(table), bench.rig(table)).with_model(DecayModel(cubic=True))
+    return FreeVibration(cut_at_release(table), bench.rig(table)).with_model(model)
 
 
 def test_a_slow_release_is_told_from_a_further_force() -> None:
@@ -323,7 +327,7 @@ def test_a_slow_release_is_told_from_a_further_force() -> None:
     """
     judged = {}
     for ramp, cubic in ((0.4, 0.0), (1e-3, -0.15)):
-        e = _released(ramp, cubic)
+        e = _released(ramp, cubic, DecayModel(cubic=True))
         values = Screening(e).fit(e.model)[0].values
         theta = {**values, **{row.name: values[row.symbol] for row in e.parameters if row.symbol in values}}
         theta[e.scatters[0]] = 8e-6
@@ -340,6 +344,26 @@ def test_a_slow_release_is_told_from_a_further_force() -> None:
     assert judged[0.0][1] < 1e-6
     assert judged[0.0][0]["start"] > 1.4 / 6.0
     assert judged[-0.15][1] > 0.01
+
+
+@pytest.mark.parametrize(
+    ("ramp", "louder", "noise", "low", "high"),
+    [
+        (0.4, 1.0, "ar1", 0.0, 1e-6),
+        (1e-3, 5.0, "white", 0.0, 1e-3),
+        (1e-3, 1.0, "ar1", 0.05, 1.0),
+        (1e-3, 1.0, "white", 0.05, 1.0),
+    ],
+)
+def test_a_slow_release_is_told_from_noise(ramp: float, louder: float, noise: str, low: float, high: float) -> None:
+    """Before: k1 5 sd low and trusted where the true words were stated, since coloured noise took up the slow release.
+
+    Controls: releases at once.
+    """
+    e = _released(ramp, 0.0, DecayModel(noise=noise, thin=4 if noise == "ar1" else 1), louder)
+    values = Screening(e).fit(e.model)[0].values
+    theta = {row.name: values.get(row.symbol, 8e-6) for row in e.parameters}
+    assert low <= cast(tuple, onset(e, {**values, **theta}))[1] <= high
 
 
 @pytest.mark.parametrize(

@@ -286,12 +286,13 @@ def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | Non
 
 
 def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float, float] | None:
-    """Compare a decay with further forces with its readings after the first half period, which a release shapes.
+    """Compare a decay with its readings after the first half period, which a release shapes.
 
-    Return facts, the p-value of equal parameters, and the smallest force there, in sds. By one linear step from the fit: dry
-    friction has many maxima, and a fit of the later readings may end at another one.
+    Return facts, the p-value of equal parameters and of residuals that are not larger before, and the smallest further force
+    there, in sds. By one linear step from the fit: dry friction has many maxima, and a fit of the later readings may end at
+    another one.
     """
-    if not e.model.symbols or (e.order == 2 and "dry" in e.model.damping):
+    if e.order == 2 and "dry" in e.model.damping:
         return None
     left, design, moved = sensitivities(e, theta)
     half = float(np.pi / e.rough.Omega_o)
@@ -309,13 +310,16 @@ def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float, float] |
     covariance = noise * np.linalg.pinv(scaled.T @ scaled)[np.ix_(at, at)]
     change, sd = (part - step)[at], np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     # The estimate from all readings shares the later ones, so the covariance of the change is at most this one.
-    p = float(stats.chi2.sf(change @ np.linalg.pinv(covariance) @ change, len(names)))
+    equal = stats.chi2.sf(change @ np.linalg.pinv(covariance) @ change, len(names))
+    # Ranks: one wrong reading there is no release.
+    louder = stats.mannwhitneyu(np.abs(known[~later, 0]), np.abs(known[later, 0]), alternative="greater")
+    p = float(stats.combine_pvalues(np.maximum([equal, louder.pvalue], np.finfo(float).tiny)).pvalue)
     values = {name: theta[name] + float(change[i] / unit[at[i]]) for i, name in enumerate(names)}
     sizes = {name: abs(values[name]) * unit[at[i]] / sd[i] for i, name in enumerate(names)}
     name = names[int(np.argmax(np.abs(change) / sd))]
     facts = {"label": e.label, "name": name, "whole": theta[name], "later": values[name], "unit": parameter(name).unit}
     facts |= {"p": p, "start": float(decay_window(e.table)[0][0]) + half}
-    return facts, p, min(sizes[symbol] for symbol in e.model.symbols)
+    return facts, p, min((sizes[symbol] for symbol in e.model.symbols), default=np.inf)
 
 
 def check_onset(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:

@@ -519,8 +519,8 @@ _HELD = (
 _FREE = "If the rod is free from the first reading of the fit on, add this line to the experiment in rig.toml: "
 _FREE += line_of("start")
 _SLOW = (
-    "A slow release, or a hand that still touches the rod, looks like a further force. Add this line to the experiment in "
-    "rig.toml, with the time from which on the rod is free: " + line_of("start")
+    "A slow release, or a hand that still touches the rod, looks like a further force or noise. Add this line to the "
+    "experiment in rig.toml, with the time from which on the rod is free: " + line_of("start")
 )
 
 MESSAGES = {
@@ -548,7 +548,7 @@ MESSAGES = {
         ),
         fail=(
             "{label}: expected the same {name} without the first half period; all readings give {whole:.4g}, the later ones "
-            "{later:.4g} {unit} ({p:p} for all parameters). " + _SLOW
+            "{later:.4g} {unit} ({p:p} for all parameters and larger residuals before). " + _SLOW
         ),
     ),
     "decays.stiffness": Message(

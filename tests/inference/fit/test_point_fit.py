@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,6 +65,33 @@ def test_it_is_a_maximum(twin: LogPosterior, fit: PointFit) -> None:
     assert np.max(np.abs(0.5 * (gradient + backward))) < 0.02
     # The curvature of whitened coordinates is 1: forward less backward difference is the step.
     np.testing.assert_allclose((gradient - backward) / step, 1.0, atol=0.02)
+
+
+def test_the_curvature_is_taken_anew_where_a_quarter_of_the_steps_does_not_suffice(
+    twin: LogPosterior, fit: PointFit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Control: as many steps and one curvature stop before the maximum, and the other starts spend no more steps there."""
+    calls = list[tuple[int, bool]]()
+    plain = point_module.polish
+
+    def counted(*args: Any) -> tuple[np.ndarray, float, bool]:
+        found = plain(*args)
+        calls.append((args[3], found[2]))
+        return found
+
+    monkeypatch.setattr(point_module, "polish", counted)
+    monkeypatch.setattr(point_module, "BASIN_SOLVER", replace(point_module.BASIN_SOLVER, max_steps=1))  # ends far off
+    monkeypatch.setattr(point_module, "MAX_STEPS", 40)
+    again = point_fit(twin, seed=5)
+    assert np.max(again.log_posterior) == pytest.approx(np.max(fit.log_posterior), abs=1e-4)
+    assert calls[0] == (10, False)
+    assert (10, True) in calls
+    assert calls[-1][0] == 40
+    calls.clear()
+    monkeypatch.setattr(point_module, "MAX_STEPS", 10)
+    monkeypatch.setattr(point_module, "ROUNDS", 1)
+    assert point_fit(twin, seed=5).stalled.all()
+    assert {steps for steps, _ in calls} == {10}
 
 
 def test_one_difference_for_all_scatters_leads_to_the_same_maximum(
