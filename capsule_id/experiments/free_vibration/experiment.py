@@ -313,9 +313,8 @@ def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float, float] |
     equal = stats.chi2.sf(change @ np.linalg.pinv(covariance) @ change, len(names))
     # Ranks: one wrong reading there is no release.
     louder: Any = stats.mannwhitneyu(np.abs(known[~later, 0]), np.abs(known[later, 0]), alternative="greater")
-    p = float(
-        stats.chi2.sf(-2.0 * np.sum(np.log(np.maximum([equal, louder.pvalue], np.finfo(float).tiny))), 4)
-    )  # Fisher's sum
+    both = np.maximum([equal, louder.pvalue], np.finfo(float).tiny)
+    p = float(stats.chi2.sf(-2.0 * np.sum(np.log(both)), 2 * len(both)))  # Fisher's sum
     values = {name: theta[name] + float(change[i] / unit[at[i]]) for i, name in enumerate(names)}
     sizes = {name: abs(values[name]) * unit[at[i]] / sd[i] for i, name in enumerate(names)}
     name = names[int(np.argmax(np.abs(change) / sd))]
