@@ -219,6 +219,33 @@ def test_decays_of_one_rig_have_one_frequency() -> None:
     assert "The ratio is near 60 (min and s)." in text(finding)
 
 
+def test_a_hold_before_a_decay_is_no_frequency_and_hides_no_scale() -> None:
+    """Before: a second decay "1.6 times" the first one, "not trusted", and k2 of a spring 3380 times k1."""
+    time = np.arange(-2.0, 0.5, 1.0 / 2000.0)
+    x = np.where(time < 0.0, bench.released(np.zeros(1), 2e-3), bench.released(np.maximum(time, 0.0), 2e-3))
+    x += 4e-6 * np.random.default_rng(5).standard_normal(len(time))
+    held, later = (
+        bench.table(
+            "free_vibration", [bench.column("time", time[a:] - time[a]), bench.column("x_rel", x[a:])], f"from_{a}"
+        )
+        for a in (0, 3800)
+    )
+    assert found(bench.rig(held, later), "decays.frequency") == []
+
+    def spring(factor: float, wrong: float = 1.0) -> Table:
+        deflection = np.array([1e-4, 2e-4, 3e-4])
+        columns = [
+            bench.column("deflection", wrong * deflection),
+            bench.column("force", factor * bench.K1 * deflection),
+        ]
+        return bench.table("support_spring", columns, "soft", spring="soft")
+
+    for factor in (1.0, 250.0):
+        assert found(bench.rig(held, spring(factor)), "readings.magnitude") == []
+        for wrong in (1e-3, 1e3):
+            assert found(bench.rig(held, spring(factor, wrong)), "readings.magnitude") != []
+
+
 @pytest.mark.full
 def test_a_rod_that_friction_holds_after_one_swing_needs_a_larger_release() -> None:
     """F_dry is 0.35 of the spring's force at the first release, and 0.07 of it at the second."""
@@ -228,7 +255,7 @@ def test_a_rod_that_friction_holds_after_one_swing_needs_a_larger_release() -> N
         bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)])
         for x in (np.asarray(rubbed(time, forces, release, 0.0, 30).x_rel) for release in (2e-3, 1e-2))
     )
-    with pytest.raises(cid.InputError, match="release it from a larger deflection"):
+    with pytest.raises(cid.InputError, match="release it at once, from a larger deflection"):
         KINDS["free_vibration"].check([one])
     KINDS["free_vibration"].check([larger])
 

@@ -192,8 +192,10 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
         rule = f"{channel} must pass its rest position, or show how it comes to rest there by damping"
         fit = viscous_fit(time, values)
         if likelihood_gain(fit, viscous_fit(time, values, 3, CHANNELS[channel].order)) > BETTER:
-            value = f"one stroke of {len(values)} samples, after which dry friction holds the rod"
-            raise InputError(rule, value, "release it from a larger deflection, or reduce the friction", *place)
+            value = f"one stroke of {len(values)} samples: dry friction holds the rod, or its release was slow"
+            raise InputError(
+                rule, value, "release it at once, from a larger deflection, or reduce the friction", *place
+            )
         alone = likelihood_gain(viscous_fit(time, values, 1), fit) < 2.0 * BETTER
         if alone or fit.omega * np.ptp(time) < SLOWEST:
             remedy = (

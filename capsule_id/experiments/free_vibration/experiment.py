@@ -158,11 +158,9 @@ def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
 
 
 def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
-    """Check the forces that a second fit has chosen, and no setting states.
-
-    They are far from 0 in the sample, and no rounding error of coarse levels stands in their place.
-    """
-    found = {symbol: e for e in records if e.replaced for symbol in e.model.symbols} if fit.draws else {}
+    """Check further forces: one that no setting states is far from 0 in the sample; none stems from coarse levels."""
+    having = {symbol: e for e in records for symbol in e.model.symbols}
+    found = {symbol: e for symbol, e in having.items() if e.replaced and fit.draws}
     draws = {symbol: np.array([draw[symbol] for draw in fit.draws]) for symbol in found}
     z = {symbol: float(abs(np.mean(values)) / np.std(values)) for symbol, values in draws.items()}
     return [
@@ -177,7 +175,7 @@ def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Find
         if z[symbol] < VISIBLE
     ] + [
         Finding("decays.coarse", "warn", {"label": e.label, "name": symbol, **facts}, e.label, (symbol, "c"))
-        for symbol, e in found.items()
+        for symbol, e in having.items()
         if (facts := coarse_levels(e))["share"] < COARSE
     ]
 
@@ -235,7 +233,9 @@ def later_start(e: DecayRecord) -> Facts:
     begin = int(np.flatnonzero(size > 0.5 * np.max(size))[-1]) + 1
     left = e.time[begin:][: length_of_motion(e.values[begin:])] if begin < len(e.time) else e.time[:0]
     # Half of what a record needs whose halves are compared.
-    if len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_SWINGS // 2:
+    few = len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_SWINGS // 2
+    # Beyond half of critical damping one exponential is left of a decay.
+    if few or e.rough.c * e.rough.Omega_o > e.rough.k1:
         return {"start": None}
     digits = max(0, int(np.ceil(-np.log10(median_step(e.time)))))
     return {"start": float(np.round(decay_window(e.table)[0][0] + e.time[begin], digits))}
@@ -319,7 +319,11 @@ def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float, float] |
     sizes = {name: abs(values[name]) * unit[at[i]] / sd[i] for i, name in enumerate(names)}
     name = names[int(np.argmax(np.abs(change) / sd))]
     facts = {"label": e.label, "name": name, "whole": theta[name], "later": values[name], "unit": parameter(name).unit}
-    facts |= {"p": p, "start": float(decay_window(e.table)[0][0]) + half}
+    # After half a period a part of an exponential release is left; after a period nothing of a strongly damped decay.
+    light = theta["c"] < np.sqrt(theta["k1"] * theta["m1"])
+    free = e.time[light & (e.time > e.time[0] + 2.0 * half)]
+    start = float(decay_window(e.table)[0][0] + free[0]) if len(free) > SHORTEST else None
+    facts |= {"p": p, "start": start}
     return facts, p, min((sizes[symbol] for symbol in e.model.symbols), default=np.inf)
 
 

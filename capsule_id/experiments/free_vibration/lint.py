@@ -14,6 +14,7 @@ from capsule_id.experiments.free_vibration.readings import (
     MOST_PERIODS,
     DecayModel,
     block_size,
+    cut_at_release,
     default_block_size,
     first_periods,
     release_time,
@@ -146,7 +147,7 @@ def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[
     channel = next(name for name in first.columns if name != "time")
     if first.label == table.label or channel not in table.columns:
         return
-    used = window_of(first)
+    used = window_of(cut_at_release(first))
     ratio = frequency / decay_frequency(first["time"][used], first[channel][used])
     if not 1.0 / LARGEST_RATIO < ratio < LARGEST_RATIO:
         near = next(
@@ -469,6 +470,18 @@ def _with_smaller(text: str, facts: Facts) -> str:
     return filled_in(text, {**facts, "smaller": smaller})
 
 
+def _with_slow(text: str, facts: Facts) -> str:
+    """``text`` with the doubt in a release, and what to do, in the place of ``{slow}``."""
+    remedy = "Release the rod at once and record again"
+    if facts["start"] is not None:
+        line = filled_in(line_of("start"), facts)
+        remedy = (
+            "Add this line to the experiment in rig.toml, with the time from which on the rod is free (here after a period): "
+        ) + line
+    slow = "A slow release, or a hand that still touches the rod, looks like a further force or noise. " + remedy
+    return filled_in(text, {**facts, "slow": slow})
+
+
 def _drift(facts: Facts) -> str:
     """What the drift of the zero hides: the motion, or an error of the model."""
     seen = (
@@ -518,10 +531,6 @@ _HELD = (
 )
 _FREE = "If the rod is free from the first reading of the fit on, add this line to the experiment in rig.toml: "
 _FREE += line_of("start")
-_SLOW = (
-    "A slow release, or a hand that still touches the rod, looks like a further force or noise. Add this line to the "
-    "experiment in rig.toml, with the time from which on the rod is free: " + line_of("start")
-)
 
 MESSAGES = {
     **LINT_MESSAGES,
@@ -541,14 +550,15 @@ MESSAGES = {
     "decays.onset": Message(
         "first half period of a decay",
         ok="{labels}: the readings after the first half period give the same parameters",
-        warn=(
+        warn=partial(
+            _with_slow,
             "{label}: the readings after the first half period do not show the further force that the second fit found. "
-            + _SLOW
-            + ". If the rod was free at once, state the words of damping and stiffness that the second fit names."
+            "{slow}. If the rod was free at once, state the words of damping and stiffness that the second fit names.",
         ),
-        fail=(
+        fail=partial(
+            _with_slow,
             "{label}: expected the same {name} without the first half period; all readings give {whole:.4g}, the later ones "
-            "{later:.4g} {unit} ({p:p} for all parameters and larger residuals before). " + _SLOW
+            "{later:.4g} {unit} ({p:p} for all parameters and larger residuals before). {slow}",
         ),
     ),
     "decays.stiffness": Message(
