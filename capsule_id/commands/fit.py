@@ -220,20 +220,11 @@ def fitted_rig(rig: Rig, options: Namespace, root: Path, kinds: Registry | None 
     return write.result_files(result), line, result.clean
 
 
-def _in_worker(rig: Rig, options: Namespace, root: Path) -> FittedRig:
-    """Return ``fitted_rig`` of another process, where xarray would ask Dask for a lock that only a named file can have."""
-    from dask import config
-
-    with config.set(scheduler="synchronous"):
-        return fitted_rig(rig, options, root)
-
-
 def _on_cluster(
     client: "Client", rigs: Sequence[Rig], options: Namespace, root: Path
 ) -> Iterator[tuple[Rig, Callable[[], FittedRig]]]:
     """Results as they arrive. The scheduler gives the rig of a worker that dies to another one."""
-    run = fitted_rig if options.scheduler == "threads" else _in_worker
-    tasks = {client.submit(run, rig, options, root, pure=False): rig for rig in rigs}
+    tasks = {client.submit(fitted_rig, rig, options, root, pure=False): rig for rig in rigs}
     while tasks:
         # A wait for the next result would not notice an interruption.
         stop_if_interrupted()

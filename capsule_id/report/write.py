@@ -9,13 +9,14 @@ import io
 import json
 import math
 import re
+import sys
 from collections import defaultdict
 from collections.abc import Container, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -329,13 +330,13 @@ def netcdf_bytes(data: xr.DataTree | xr.Dataset) -> bytes:
 
     The arrays of a tree are compressed without loss: a walker that stays repeats its draw.
     """
-    file = io.BytesIO()
-    if isinstance(data, xr.Dataset):
-        data.to_netcdf(file, engine="h5netcdf")
-    else:
+    packed, file, dask = None, io.BytesIO(), cast(Any, sys.modules.get("dask"))
+    if isinstance(data, xr.DataTree):
         arrays = {node.path: [name for name, own in node.data_vars.items() if own.size > 1] for node in data.subtree}
         packed = {path: {name: dict(_PACKED) for name in names} for path, names in arrays.items()}
-        data.to_netcdf(file, engine="h5netcdf", encoding=packed)
+    # Beside a cluster xarray would ask Dask for a lock, which only a file with a name can have.
+    with nullcontext() if dask is None else dask.config.set(scheduler="synchronous"):
+        cast(Any, data).to_netcdf(file, engine="h5netcdf", encoding=packed)
     return file.getvalue()
 
 

@@ -143,7 +143,7 @@ def test_an_interruption_ends_the_study(
     assert line.startswith("fit-params: interrupted")
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_a_study_of_many_rigs_survives_the_death_of_a_worker(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,6 +1,7 @@
 """The files of a result: strict JSON in the agreed shape, a table, pictures, a netCDF file that ArviZ opens."""
 
 import dataclasses
+import io
 import json
 import warnings
 from collections.abc import Callable
@@ -8,11 +9,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
+import dask
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
 
+from capsule_id.commands.bifurcate import client_of
 from capsule_id.errors import OutputError
 from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import symbol_of
@@ -393,3 +396,13 @@ def test_writing_is_quick(maker: Callable[..., Result], tmp_path: Path) -> None:
     start = process_time()
     load_fields(tmp_path, result.registry)
     assert process_time() - start < 1.0
+
+
+@pytest.mark.full
+def test_netcdf_is_written_beside_a_cluster() -> None:
+    """Before: a map and the fits of several rigs ended with "Semaphore or Lock not known" for --scheduler processes."""
+    data = xr.Dataset({"x": ("time", np.arange(3.0))})
+    with client_of("processes"):
+        written = netcdf_bytes(data)
+    assert dask.config.get("scheduler", None) is None
+    assert xr.load_dataset(io.BytesIO(written)).identical(data)
