@@ -117,7 +117,7 @@ def client_of(scheduler: str | None) -> "Iterator[Client | None]":
     local = {
         "processes": processes,
         "threads_per_worker": 1 if processes else None,
-        "dashboard_address": None,
+        "dashboard_address": "127.0.0.1:0",  # any free port: another cluster may hold the default one
         "silence_logs": logging.CRITICAL,
     }
     with ExitStack() as opened:
