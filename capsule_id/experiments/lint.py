@@ -208,8 +208,9 @@ def _against_k1(table: Table[Any], rig: Rig) -> Iterable[Number]:
     if decay is None or rig.m1 is None or not {"deflection", "force"} <= set(table.columns):
         return
     time, values = decay["time"], decay["x_rel"]
-    free = find_free_decay(time, values)  # a long hold has a frequency of its own
-    k1 = rig.m1.value * (2.0 * np.pi / (1.0 / frequency_of(time, values) if free is None else free.period)) ** 2
+    free = find_free_decay(time, values, displacement=True)  # a long hold has a frequency of its own
+    frequency = frequency_of(time, values) if free is None else 1.0 / free.period
+    k1 = rig.m1.value * (2.0 * np.pi * frequency) ** 2
     ratio = float(np.ptp(table["force"]) / (np.ptp(table["deflection"]) or 1e-30)) / k1
     scales, shared = (f"{table.label}.force", f"{table.label}.deflection"), ("m1", f"{decay.label}.time")
     yield Number(f"k2 of {table.file} over k1", ratio, "1", STIFFNESSES, scales, table.label, shared=shared)

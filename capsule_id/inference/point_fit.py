@@ -166,7 +166,7 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
         spread = np.sqrt(np.sum(np.matmul(*roots) ** 2, axis=1))
         away = np.any(np.abs(ends - highest[0])[:, located] > SAME_BASIN * spread[located], axis=1)
         away[best] = False
-        # Where the best end stalls, the others would too, and the check of the starts fails in any case.
+        # Where even the best end stalls, a long search from the others is of no use.
         steps = MAX_STEPS if highest[2] else MAX_STEPS // ROUNDS
         others = list(threads.map(lambda end: polish(target, end, roots, steps), ends[away]))
     polished = [others.pop(0) if own else highest for own in away]

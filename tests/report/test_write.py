@@ -402,7 +402,7 @@ def test_writing_is_quick(maker: Callable[..., Result], tmp_path: Path) -> None:
 def test_netcdf_is_written_beside_a_cluster() -> None:
     """Before: a map and the fits of several rigs ended with "Semaphore or Lock not known" for --scheduler processes."""
     data = xr.Dataset({"x": ("time", np.arange(3.0))})
-    with client_of("processes"):
+    with client_of("threads"), client_of("processes"):  # a second cluster takes another port
         written = netcdf_bytes(data)
     assert dask.config.get("scheduler", None) is None
     assert xr.load_dataset(io.BytesIO(written)).identical(data)

@@ -552,8 +552,8 @@ MESSAGES = {
         ok="{labels}: the readings after the first half period give the same parameters",
         warn=partial(
             _with_slow,
-            "{label}: the readings after the first half period do not contradict the first model, as the second fit supposes. "
-            "{slow}. If the rod was free at once, state the words that the second fit names.",
+            "{label}: the readings after the first half period agree with the first model, so the second fit rests on that "
+            "half period alone. {slow}. If the rod was free at once, state the words that the second fit names.",
         ),
         fail=partial(
             _with_slow,
