@@ -423,6 +423,20 @@ def test_a_second_fit_that_later_readings_support_is_not_doubted() -> None:
         assert [f.level for f in findings] == [level]
 
 
+def test_a_second_fit_that_the_first_half_period_alone_demands_is_doubted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a whole the record contradicts the first model. Control: another record whose later readings do so too."""
+    screened = Screened(0.0, {}, {}, NOISE, np.zeros(250))
+    slow = _released(0.4, 0.0, DecayModel(cubic=True))
+    assert demands_another(slow.with_model(DecayModel()), 0.002)
+    slow = slow.with_model(DecayModel(cubic=True), screened)
+    cubic = record(0.0, {"k_cubic": 0.3 * SPRING_FORCE / RELEASE**3}).with_model(DecayModel(cubic=True), screened)
+    facts = {"label": "decay", "half": float(np.pi / slow.rough.Omega_o)}
+    monkeypatch.setattr(experiment, "onset", lambda e, theta: (facts, 0.5))  # the whole fit hides the release
+    values = SimpleNamespace(values=dict.fromkeys((row.name for row in slow.parameters), 1.0), draws=[], flagged={})
+    assert [f.level for f in check_onset([slow], values)] == ["warn"]
+    assert [f.level for f in check_onset([slow, cubic], values)] == ["ok"]
+
+
 @pytest.mark.parametrize(("ratio", "proposed"), [(0.1, True), (0.8, False), (1.2, False)])
 def test_no_later_start_is_proposed_for_a_strongly_damped_decay(ratio: float, proposed: bool) -> None:
     """The zero creeps back. (Before: the start left one exponential of such a decay, and c was trusted, 46 sd off.)"""

@@ -71,15 +71,20 @@ def test_the_curvature_is_taken_anew_where_a_quarter_of_the_steps_does_not_suffi
     twin: LogPosterior, fit: PointFit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Control: as many steps and one curvature stop before the maximum, and the other starts spend no more steps there."""
-    calls = list[tuple[int, bool]]()
-    plain = point_module.polish
+    calls, places = list[tuple[int, bool]](), list[tuple[float, ...]]()
+    plain, curvature = point_module.polish, point_module.root_of_covariance
 
     def counted(*args: Any) -> tuple[np.ndarray, float, bool]:
         found = plain(*args)
         calls.append((args[3], found[2]))
         return found
 
+    def placed(target: LogPosterior, u: np.ndarray, *rest: Any) -> tuple[np.ndarray, np.ndarray]:
+        places.append(tuple(u))
+        return curvature(target, u, *rest)
+
     monkeypatch.setattr(point_module, "polish", counted)
+    monkeypatch.setattr(point_module, "root_of_covariance", placed)
     monkeypatch.setattr(point_module, "BASIN_SOLVER", replace(point_module.BASIN_SOLVER, max_steps=1))  # ends far off
     monkeypatch.setattr(point_module, "MAX_STEPS", 40)
     again = point_fit(twin, seed=5)
@@ -87,6 +92,7 @@ def test_the_curvature_is_taken_anew_where_a_quarter_of_the_steps_does_not_suffi
     assert calls[0] == (10, False)
     assert (10, True) in calls
     assert calls[-1][0] == 40
+    assert len(set(places)) == len(places) > 2  # each time at another point
     calls.clear()
     monkeypatch.setattr(point_module, "MAX_STEPS", 10)
     monkeypatch.setattr(point_module, "ROUNDS", 1)
