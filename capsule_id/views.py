@@ -3,7 +3,7 @@
 Experiments and checks make them with codes and numbers; the report adds the texts and renders them.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from string import Formatter
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -28,6 +28,12 @@ SMALLEST_P = 1e-10
 def counted(number: int, noun: str) -> str:
     """``1 row``, ``2 rows``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def listed(labels: Iterable[str]) -> str:
+    """The labels of a text that concerns them all: of more than ten the first eight, and how many others."""
+    labels = list(labels)
+    return ", ".join(labels if len(labels) <= 10 else [*labels[:8], f"and {len(labels) - 8} others"])
 
 
 def after_number(unit: str) -> str:

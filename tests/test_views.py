@@ -6,7 +6,7 @@ import pytest
 
 from capsule_id.experiments.kind import default_registry
 from capsule_id.report.messages import messages_of
-from capsule_id.views import Message, counted
+from capsule_id.views import Message, counted, listed
 from tests.cli_tools import ROOT
 
 #: A count before a plural, without the format of counts. The first word after it is the noun or its adjective.
@@ -22,6 +22,7 @@ SEVERAL = {
     "{len(names)} parameters", "{samples} samples", "{len(values)} samples", "{records} records",
     "{rows} rows", "{count} friction laws",
     "{len(found.blocks)} blocks", "{len(found)} releases", "{len(several)} releases",
+    "{number} such panels", "{len(labels) - 8} others",
 }  # fmt: skip
 
 
@@ -30,6 +31,8 @@ def test_a_count_has_its_plural() -> None:
     assert message.text("warn", {"rows": 1, "size": 0.1234, "lost": 0}) == "1 row of 0.12 m, 0 missing samples"
     assert message.text("warn", {"rows": 12, "size": 1.0, "lost": 1}) == "12 rows of 1 m, 1 missing sample"
     assert counted(2, "row") == "2 rows"
+    assert listed(["a", "b"]) == "a, b"
+    assert listed([f"d{i}" for i in range(11)]) == "d0, d1, d2, d3, d4, d5, d6, d7, and 3 others"
     with pytest.raises(KeyError):
         message.text("warn", {"rows": 1})
 

@@ -191,7 +191,8 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
             if first + LEGS < last
             else anchor
         )
-        begin, fit, stop = _whole(record, anchor, lengths, sizes) or _release(record, anchor, early)
+        whole = _whole(record, anchor, lengths, sizes) or _held(record, anchor, lengths, sizes)
+        begin, fit, stop = whole or _release(record, anchor, early)
         over = float(record.time[begin]) + DIED_OUT / max(fit.poles[0] * fit.poles[1], 1e-9)
         start, pushed = float(time[0]), False
         if begin > 0 and np.sum(time >= record.time[begin]) > WINDOW // 4:
@@ -466,6 +467,28 @@ def _whole(
         _Fit((omega, zeta), float(squares[-1]) * record.noise**2, record.noise, record.noise, float(found[0])),
         None,
     )
+
+
+def _held(record: _Record, begin: int, lengths: np.ndarray, sizes: np.ndarray) -> tuple[int, _Fit, float | None] | None:
+    """As ``_whole``, where a hold comes before: the first sample that leaves the mean of those before it is free.
+
+    It lies behind the release, so that it needs no ``MARGIN``. The hold is where the decay turns: a clipped top is none.
+    """
+    means = np.cumsum(record.values)[:-1] / np.arange(1.0, len(record.values))
+    left = np.abs(record.values[1:] - means) > SIGNIFICANT * record.noise
+    first = 1 + int(np.argmax(left))
+    if not WINDOW // 4 < first < begin:
+        return None
+    after = replace(record, time=record.time[first:], values=record.values[first:])
+    if (whole := _whole(after, begin - first, lengths, sizes)) is None:
+        return None
+    (omega, zeta), free = whole[1].poles, slice(after.end(begin - first))
+    motions = _motions(omega * (after.time[free] - after.time[0]), zeta)[0]
+    level, x, v = np.linalg.lstsq(motions, after.values[free], rcond=1e-9)[0]
+    error = record.noise * np.sqrt(1.0 / first + 5.0 / len(motions))  # five unknowns
+    if abs(np.hypot(x, v) - abs(means[first - 1] - level)) > SIGNIFICANT * error:
+        return None
+    return record.at(record.time[first] - MARGIN * record.period), *whole[1:]
 
 
 def _release(record: _Record, begin: int, early: int) -> tuple[int, _Fit, float | None]:

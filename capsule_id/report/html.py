@@ -4,7 +4,7 @@ import base64
 import math
 import numbers
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, count
@@ -47,6 +47,8 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 _LONGEST = 80
 # Wider than this (CSS pixels) does not go in pairs.
 _HALF_PAGE = 650
+#: Panels of one kind that are drawn; of more, those whose readings fit worst.
+MOST_PANELS = 24
 #: Symbols of the sketch of the rig.
 SKETCHED = ("m1", "m2", "k1", "c", "k2", "G", "mu")
 
@@ -106,8 +108,15 @@ def drawings(result: Result) -> Iterator[Drawing]:
     labels = [
         item.label if item.label.startswith(item.kind) else f"{item.kind}_{item.label}" for item in result.comparisons
     ]
+    numbers, worst = Counter(item.kind for item in result.comparisons), worst_panels(result)
     for name, item in zip(_unique(labels), result.comparisons, strict=True):
+        if item.label not in worst[item.kind]:
+            continue
         caption, figure = comparison_caption(item, result.registry.captions), figures.comparison_figure(item)
+        if (number := numbers[item.kind]) > MOST_PANELS:
+            caption += (
+                f" Drawn are the {MOST_PANELS} of {number} such panels that fit worst; plot_comparison draws any."
+            )
         yield name, "measured", item.title, caption, figure, comparison_alt(item), _group(result, item.label)
     labels = _unique(record.name for record in result.records)
     for label, record in zip(labels, result.records, strict=True):
@@ -136,6 +145,22 @@ def drawings(result: Result) -> Iterator[Drawing]:
     ax = new_axes(*figures.starts_size(fit), left=2.6, bottom=0.7, top=0.6)
     figures.point_fit_starts(fit, ax)
     yield "point_fit_starts", "point_fit", "Starts of the point fit", caption, figure_of(ax), alt, ""
+
+
+def worst_panels(result: Result) -> dict[str, set[str]]:
+    """Labels of at most ``MOST_PANELS`` panels of each kind: first those with findings, then the least predictive p."""
+    places = sorted(((_WORST_FIRST.index(one.level), one.experiment) for one in result.findings), reverse=True)
+    found = {label: place for place, label in places}
+
+    def fits_worst(item: Comparison) -> tuple[int, float]:
+        p = 1.0 if item.predictive_p is None else item.predictive_p
+        return found.get(_group(result, item.label), len(_WORST_FIRST)), p
+
+    worst = defaultdict[str, set[str]](set)
+    for item in sorted(result.comparisons, key=fits_worst):
+        if len(worst[item.kind]) < MOST_PANELS:
+            worst[item.kind].add(item.label)
+    return worst
 
 
 def _group(result: Result, label: str) -> str:

@@ -409,7 +409,7 @@ QUESTIONS: Mapping[str, str] = {
     "model.engine": "Would the exact engine change the numbers? By {largest:.2g} sd, limit {wanted:g}.",
     "runs.predictable": "Does one initial state predict the whole run? Its error grows {growth:.2g} times, limit 1000.",
     "runs.repeated": "Does the misfit repeat with the excitation? {p:p}, limit 0.002 over all channels.",
-    "decays.halves": "Do both halves of the record agree? {name}: {z:.2g} sd apart, limit 4 (a warning above 3).",
+    "decays.halves": "Do both halves of the record agree? {name}: {z:.2g} sd apart, limit 4 (warning 3) of one record.",
     "decays.hidden": "Do the records exclude further forces?",
     "decays.held": "Is the instant of the release known?",
     "decays.onset": "Does the first half period change the numbers? {p:p}, limit 0.002 over all records.",

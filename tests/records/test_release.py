@@ -201,19 +201,23 @@ def test_a_record_from_behind_the_release_on_keeps_its_samples(number: int) -> N
     assert lost <= 2 * number // 4
 
 
-@pytest.mark.parametrize("held", [0, 3])
-def test_no_release_is_looked_for_in_a_viscous_decay(held: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One decay from the first sample on needs no search; with three samples held before it the search finds them."""
+@pytest.mark.parametrize(("held", "before"), [(0, 1.0), (3, 1.0), (40, 1.0), (40, 0.9)])
+def test_no_release_is_looked_for_in_a_viscous_decay(held: int, before: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One decay from the first sample on, or after a hold, needs no search; a short hold, and a pull before it, do.
+
+    The first half of a hold is at ``before`` times the displacement of the second.
+    """
     searched = []
     search = release._release
     monkeypatch.setattr(release, "_release", lambda *given: searched.append(given) or search(*given))
     time = 0.01 * np.arange(400)
     motion = np.maximum(time - held * 0.01, 0.0)
     values = np.exp(-0.3 * motion) * np.cos(2.0 * np.pi * 2.0 * motion)
+    values[: held // 2] *= before
     values += 0.004 * np.random.default_rng(held).standard_normal(400)
     found = cast(FreeDecay, find_free_decay(time, values, displacement=True))
-    assert bool(searched) == (held > 0)
-    assert abs(found.start - held * 0.01) <= 0.021
+    assert bool(searched) == (held == 3 or before < 1.0)
+    assert -1e-9 <= found.start - held * 0.01 <= 0.031
     assert found.period == pytest.approx(0.5, rel=0.02)
 
 

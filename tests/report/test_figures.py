@@ -16,8 +16,8 @@ from capsule_id.inference.result import Posterior, Result
 from capsule_id.report.columns import sampled_parameters
 from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import figure_of, new_axes, new_figure, png
-from capsule_id.report.html import Picture, comparison_caption, pictures
-from capsule_id.views import Comparison, Curve, Points
+from capsule_id.report.html import Picture, comparison_caption, drawings, pictures
+from capsule_id.views import Comparison, Curve, Finding, Points
 
 #: ``name, unit``; a name alone has no unit.
 UNIT = re.compile(r",\s[^,]+$|^(autocorrelation|residual / sd|friction coefficient|step after burn-in|μ)$")
@@ -255,6 +255,18 @@ def test_hostile_text_is_drawn_as_it_stands(result: Result) -> None:
     names = [picture.name for picture in pictures(twice)]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch(r"[A-Za-z0-9_-]+", name) for name in names)
+
+
+def test_of_many_panels_the_worst_are_drawn(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: 500 decays were drawn in eight minutes, and the page held all of them. The captions name the others."""
+    monkeypatch.setattr("capsule_id.report.html.MOST_PANELS", 3)
+    decay = _named(result, "free_vibration_1")
+    decays = [dataclasses.replace(decay, label=f"d{i}", predictive_p=0.1 + 0.8 * abs(i - 4) / 9) for i in range(10)]
+    findings = (Finding("decays.drift", "warn", {}, "d9"), Finding("residuals.white", "fail", {}, "d0"))
+    many = dataclasses.replace(result, comparisons=(*decays, _named(result, "friction")), findings=findings)
+    drawn = [(name, caption) for name, section, _, caption, *_ in drawings(many) if section == "measured"]
+    assert [name for name, _ in drawn] == ["free_vibration_d0", "free_vibration_d4", "free_vibration_d9", "friction"]
+    assert ["3 of 10" in caption for _, caption in drawn] == [True, True, True, False]
 
 
 def test_a_script_without_glyphs_is_no_failure(result: Result) -> None:

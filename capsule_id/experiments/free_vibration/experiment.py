@@ -28,7 +28,7 @@ from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import sampling
 from capsule_id.records.tones import SIGNIFICANT, VISIBLE, length_of_motion, other_tone
 from capsule_id.rig.filters import median_step
-from capsule_id.views import Facts, Finding, Level, ResultTable
+from capsule_id.views import Facts, Finding, Level, ResultTable, listed
 
 #: Rounding errors are no noise where all noise is below this share of the distance of levels; rounding alone is 0.29 of it.
 COARSE = 0.42
@@ -44,8 +44,20 @@ LARGER = 1.3
 STEPS, FEWEST_SIZES = 3.0, 30
 
 
+#: The level of what was seen in one decay of so many.
+Graded = Callable[[int], Level]
 #: A judge of one decay at its values by symbol: facts, and a level or a p-value; None where it cannot be judged.
-Judge = Callable[[Any, ValuesBySymbol], tuple[Facts, Level | float] | None]
+Judge = Callable[[Any, ValuesBySymbol], tuple[Facts, Level | Graded | float] | None]
+
+
+def graded(z: float, matters: bool) -> Graded:
+    """Grade a deviation of ``z`` sd: a chance of one in many decays counts as it would in a single one (Bonferroni)."""
+
+    def level(number: int) -> Level:
+        alone = stats.norm.isf(min(number * stats.norm.sf(z), 0.5))
+        return "ok" if not alone > VISIBLE else "fail" if alone > SIGNIFICANT and matters else "warn"
+
+    return level
 
 
 def each(code: str, judge: Judge, joined: bool = True) -> Check:
@@ -60,12 +72,13 @@ def each(code: str, judge: Judge, joined: bool = True) -> Check:
         judged = [(e, *found) for e in decays if (found := judge(e, e.local(fit.values))) is not None]
         findings = list[Finding]()
         for e, facts, found in judged:
-            level = found if isinstance(found, str) else "fail" if found * len(judged) < LEVEL else "ok"
+            level = found(len(judged)) if callable(found) else found
+            level = level if isinstance(level, str) else "fail" if level * len(judged) < LEVEL else "ok"
             if level != "ok" or not joined:
                 findings.append(Finding(code, level, {"label": e.label, **facts}, e.label))
         if judged and not findings:
             least = {"p": min(facts["p"] for _, facts, _ in judged)} if "p" in judged[0][1] else {}
-            findings.append(Finding(code, "ok", {"labels": ", ".join(e.label for e, *_ in judged), **least}))
+            findings.append(Finding(code, "ok", {"labels": listed(e.label for e, *_ in judged), **least}))
         return findings
 
     return check
@@ -115,15 +128,14 @@ Changes = Callable[[Any, ValuesBySymbol], Mapping[str, tuple[float, float, float
 def halves(changes: Changes) -> Check:
     """Return the check that both halves of every decay give the same parameters, where it is long enough."""
 
-    def judge(e: Decay, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
+    def judge(e: Decay, theta: ValuesBySymbol) -> tuple[Facts, Graded] | None:
         found = changes(e, theta)
         if not found:
             return None
         name = max(found, key=lambda name: abs(found[name][2]))
         first, second, z, matters = found[name]
         facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
-        level = "ok" if not abs(z) > VISIBLE else "fail" if abs(z) > SIGNIFICANT and matters else "warn"
-        return {**facts, "model": e.model_name, "stated": e.stated_words}, level
+        return {**facts, "model": e.model_name, "stated": e.stated_words}, graded(abs(z), matters)
 
     return each("decays.halves", judge)
 
@@ -154,7 +166,7 @@ def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
     lowest = min(rates.values())
     k1 = (2.0 * np.pi * lowest * np.sqrt(fit.values["m1"]) - np.sqrt(fit.values["k1"])) ** 2
     labels = (label for label, rate in rates.items() if np.isclose(rate, lowest))
-    facts = {"labels": ", ".join(labels), "other": float(np.sqrt(k1 / fit.values["m1"])) / (2.0 * np.pi), "k1": k1}
+    facts = {"labels": listed(labels), "other": float(np.sqrt(k1 / fit.values["m1"])) / (2.0 * np.pi), "k1": k1}
     return [Finding("decays.alias", "ok", facts)]
 
 
@@ -340,9 +352,7 @@ def check_onset(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
         findings = [
             Finding("decays.onset", "warn", facts, e.label, ("k1", "c", *e.model.symbols)) for e, facts, _ in later
         ]
-    return findings or [Finding("decays.onset", "ok", {"labels": ", ".join(e.label for e, *_ in judged)})] * bool(
-        judged
-    )
+    return findings or [Finding("decays.onset", "ok", {"labels": listed(e.label for e, *_ in judged)})] * bool(judged)
 
 
 def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> dict[str, tuple[float, float]]:

@@ -23,7 +23,7 @@ from capsule_id.experiments.statistics import without
 from capsule_id.parameters import QUANTILE_975, parameter
 from capsule_id.records.release import EVIDENCE
 from capsule_id.records.tones import VISIBLE
-from capsule_id.views import Facts, Finding, Level
+from capsule_id.views import Facts, Finding, Level, listed
 
 # sensitivities: Effects of the parameters on the readings of a decay, and of forces that the fitted model lacks.
 
@@ -228,7 +228,7 @@ def check_hidden_terms(records: Sequence[Decay], fit: Fitted) -> list[Finding]:
                 own = (name,) if level == "fail" else ()
                 findings.append(Finding("decays.hidden", level, {**facts, **changed}, parameters=own))
     if compared and not findings:
-        findings.append(Finding("decays.hidden", "ok", {"labels": ", ".join(compared)}))
+        findings.append(Finding("decays.hidden", "ok", {"labels": listed(compared)}))
     return findings
 
 
@@ -346,7 +346,7 @@ def check_held(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
                 }
                 level: Level = "warn" if value + low > 0.0 else "fail"
                 findings.append(Finding("decays.held", level, facts, e.label, (name,) if level == "fail" else ()))
-    labels = ", ".join(e.label for e in judged)
+    labels = listed(e.label for e in judged)
     return findings or [Finding("decays.held", "ok", {"labels": labels})]
 
 

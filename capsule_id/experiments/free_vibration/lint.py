@@ -662,7 +662,7 @@ MESSAGES = {
     ),
     "decays.halves": Message(
         "halves of a decay",
-        ok="{labels}: the estimates of both halves of each record agree within 3 joint sd",
+        ok="{labels}: the estimates of both halves of each record agree",
         warn=_halves,
         fail=_halves,
     ),

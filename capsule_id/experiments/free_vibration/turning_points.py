@@ -21,7 +21,7 @@ from capsule_id.experiments.base import (
 )
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
-from capsule_id.experiments.free_vibration.experiment import each, halves
+from capsule_id.experiments.free_vibration.experiment import Graded, each, graded, halves
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
     check_hidden_terms,
@@ -38,7 +38,7 @@ from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
 from capsule_id.parameters import STEP_SD, Prior, parameter
 from capsule_id.records.tones import SIGNIFICANT, VISIBLE
 from capsule_id.rig.model import Rig, Table
-from capsule_id.views import Facts, Finding, Level
+from capsule_id.views import Facts, Finding
 
 # linear: Least squares of turning points: fits of one table, effects of further forces, and changes between its halves.
 #
@@ -208,7 +208,7 @@ def check_steps(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding]
     ]
 
 
-def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
+def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Graded] | None:
     """Judge whether a further force of the decay explains the turning points better than the fitted model."""
     found = [one for symbol in e.model.absent if (one := further_force(e, theta, symbol))]
     if not found:
@@ -217,7 +217,7 @@ def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Level] | N
     key = "stiffness" if best["name"] == "k_cubic" else "damping"
     line = e.model.with_force(best["name"]).lines(key)
     facts = {**best, "line": line, "model": e.model.name, "one_side": not e.both_sides}
-    return facts, "ok" if best["z"] <= VISIBLE else "fail" if best["z"] > SIGNIFICANT and best["moved"] else "warn"
+    return facts, graded(best["z"], best["moved"])
 
 
 # second fit: Choice of the forces of turning points where the readings contradict the stated ones.

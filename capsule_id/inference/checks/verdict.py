@@ -248,6 +248,8 @@ def _boundary(s: SampledFit) -> list[Finding]:
 
 #: Fewest parts of the data, and most parts of one table.
 FEWEST_PARTS, MOST_PARTS = 4, 8
+#: Tests whose few parts are many.
+MANY_TESTS = 32
 #: Fewest rows of a part, relative to the number of unknowns of its experiment.
 ROWS_PER_UNKNOWN = 2
 #: Largest sd of a part that determines a parameter, relative to its value.
@@ -263,8 +265,8 @@ def widenings(s: SampledFit) -> dict[str, Widening]:
     by_load = {f.experiment for f in s.findings if f.code == "trials.loads" and f.level == "fail"}
     tests = [e for e in s.experiments if e.kind in kinds and e.bench and not has_own_nuisances(e)]
     found: dict[str, Widening] = {}
-    # Long parts show slow errors, many parts show them more surely. The widest interval counts.
-    for number in (FEWEST_PARTS, MOST_PARTS):
+    # Long parts show slow errors, many parts show them more surely: many tests are many parts. The widest interval counts.
+    for number in (FEWEST_PARTS, MOST_PARTS)[: 1 if len(tests) > MANY_TESTS else 2]:
         estimates: dict[str, list[tuple[float, float]]] = {}
         for e in tests:
             for name, pair in estimates_of_parts(e, s.values, number, by_load=e.label in by_load):
