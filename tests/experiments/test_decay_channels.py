@@ -17,6 +17,7 @@ from capsule_id.experiments.free_vibration.experiment import (
     check_halves,
     check_positions,
     fast_rms,
+    graded,
 )
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import decay
@@ -174,6 +175,16 @@ def halves(forces: dict[str, float], seed: int) -> list[Finding]:
     """Findings of the check at the true values."""
     fit = SimpleNamespace(values={**VISCOUS, "noise_sd[decay]": 1e-5})
     return check_halves([record("x_rel", forces, seed, 0.002)], fit)  # type: ignore[arg-type]  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("z", "number", "level"),
+    [(2.9, 1, "ok"), (3.1, 1, "warn"), (4.1, 1, "fail"), (4.4, 500, "ok"), (5.0, 500, "warn"), (5.4, 500, "fail")],
+)
+def test_a_deviation_counts_by_its_chance_in_all_records(z: float, number: int, level: str) -> None:
+    """Before: of 500 clean decays one failed and two were warned of."""
+    assert graded(z, matters=True)(number) == level
+    assert graded(z, matters=False)(number) == ("warn" if level == "fail" else level)
 
 
 def test_halves_of_a_viscous_decay_agree() -> None:

@@ -96,6 +96,38 @@ def test_the_noise_level_does_not_matter() -> None:
     assert p_values(r, columns) == pytest.approx(p_values(r + columns @ [5.0, -2.0, 1.0], columns))
 
 
+def test_p_values_beyond_the_replicates_are_not_too_small() -> None:
+    """Before: none was below 1.2e-4, so one of 20 tests could not fail. Against 200,000 replicates, and far beyond them."""
+    n, number = 60, 200_000
+    columns = np.column_stack([np.ones(n), np.arange(n)])
+    basis = np.linalg.qr(columns)[0]
+    rng = np.random.default_rng(1)
+    drawn = rng.standard_normal((number, n))
+    drawn -= drawn @ basis @ basis.T
+    drawn /= np.sqrt(np.mean(drawn**2, axis=1, keepdims=True))
+    for name in ("sign runs", "trend"):  # "largest" is studentised
+        rare = drawn[np.argsort(STATISTICS[name](drawn))[-20]]  # p = 1e-4
+        assert 0.5e-4 < p_values(rare, columns)[name] < 5e-4
+    slow = np.cos(2.0 * np.pi * np.arange(n) / n) + 0.1 * rng.standard_normal(n)
+    assert max(p_values(slow, columns)[name] for name in ("sign runs", "trend")) < 1e-6
+
+
+def test_of_many_tests_one_small_p_value_is_chance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before: of 500 clean decays two failed, and the rig was not trusted."""
+    tests = [SimpleNamespace(bench=True, event_driven=False, n=300, label=f"d{i}", local=dict) for i in range(40)]
+    monkeypatch.setattr(
+        "capsule_id.inference.checks.posterior.experiment_p_values",
+        lambda e, _: {"trend": {"d0": 5e-4, "d1": 1e-6}.get(e.label, 0.5)},
+    )
+
+    def failed(experiments: list[Any]) -> list[str]:
+        found = check_statistics(cast(Any, SimpleNamespace(experiments=experiments, values={}, flagged={})))
+        return [finding.experiment for finding in found if finding.level == "fail"]
+
+    assert failed(tests[:1]) == ["d0"]
+    assert failed(tests) == ["d1"]
+
+
 def finding_of(made: Twin) -> Finding:
     """The finding on one experiment at these values."""
     e, values = made
