@@ -118,6 +118,11 @@ MESSAGES = {
             "the readings do not reject {name}: the best of {count} friction laws is {factor:.2g} times as probable. The "
             "simplest law that the readings cannot tell from the best is {simplest} (in [model]: {line})"
         ),
+        warn=(
+            "{labels}: too few readings choose a friction law. {other} is {other_factor:.2g} times as probable as {name}, and "
+            "the mean over {count} laws is {means} ({name} alone: {now}). Repeat the slides at more speeds, or write in "
+            "[model] of rig.toml: {other_line}. Where you know that {name} holds, write in [rig]: confirmed = [{confirmed}]"
+        ),
         fail=(
             "{labels}: expected readings that {name} explains; found them {factor:.3g} times more probable under another "
             "friction law. Write in [model] of rig.toml: {line}"

@@ -429,7 +429,10 @@ QUESTIONS: Mapping[str, str] = {
     "lines.branches": "Are loading and unloading the same? {share:.1%} of the range apart ({p:p}), limit p = 0.002.",
     "friction.order": "Do the residuals of the friction tests show an order in speed? {p:p}, limit 0.002.",
     "friction.one_surface": "Do tilts and slides show one surface? {p:p}, limit 0.002.",
-    "friction.variants": "Is another friction law more probable? The best one is {factor:.3g} times as probable, limit 100.",
+    "friction.variants": (
+        "Would another friction law matter? The best one is {factor:.3g} times as probable, limit 100; "
+        "the mean over all laws moves a value by {shift:.2g} sd, limit 1.5."
+    ),
     "springs.cantilever": "Does k2 fall as L^-3? The exponent is {exponent:.3f} ± {sd:.3f} ({p:p}), limit p = 0.002.",
 }
 

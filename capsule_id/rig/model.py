@@ -185,7 +185,8 @@ class Rig:
     files : sha256 of every file read, by relative path
     model : the choices of ``[model]``
     slope, N0 : slope of the track, rad, and pressing force, N, of experiments that state no other (None: not stated)
-    confirmed : names of masses, columns and settings whose unusual values are right: ``m1``, ``decay_1.x_rel``
+    confirmed : names of masses, columns and settings whose unusual values are right: ``m1``, ``decay_1.x_rel``; "friction":
+        the law of ``model`` holds, whatever a comparison of laws says
     """
 
     name: str

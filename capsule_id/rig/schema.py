@@ -485,12 +485,12 @@ def read_confirmed(root: Node, tables: Sequence[Table[Any]], stated: Iterable[st
     Raises
     ------
     InputError
-        If it is no list of names of [rig], or of columns and settings of experiments.
+        If it is no list of names of [rig], of the word friction, or of columns and settings of experiments.
     """
     node = root["rig"].get("confirmed", [])
-    known = [*stated, *(f"{t.label}.{name}" for t in tables for name in (*t.columns, *vars(t.settings)))]
+    known = ["friction", *stated, *(f"{t.label}.{name}" for t in tables for name in (*t.columns, *vars(t.settings)))]
     node.require(isinstance(node.value, list), "be a list of names", 'write confirmed = ["m1"]')
-    rule = "quantities of [rig], or LABEL.COLUMN or LABEL.SETTING of experiments"
+    rule = "friction, quantities of [rig], or LABEL.COLUMN or LABEL.SETTING of experiments"
     return tuple(read_words(node, known, rule, "remove it"))
 
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from capsule_id.api import read_rig
 from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH
-from capsule_id.experiments.friction_variants import FACTOR
+from capsule_id.experiments.friction_variants import DOUBTFUL, FACTOR
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.inference.checks.posterior import AGREEMENT_LEVEL, FARTHEST_MAXIMUM, PRIOR_PULL
 from capsule_id.inference.checks.settings import ORDER_LEVEL, SMALLEST_CORRELATION
@@ -203,7 +203,7 @@ def test_the_limits_of_the_questions_are_those_of_the_checks() -> None:
         "sample.maximum": {FARTHEST_MAXIMUM}, "priors.tails": {PRIOR_PULL}, "trials.loads": {ORDER_LEVEL},
         "trials.order": {SMALLEST_CORRELATION, ORDER_LEVEL}, "trials.tables": {ORDER_LEVEL}, "trials.speeds": {ORDER_LEVEL},
         "bench_and_runs.agree": {AGREEMENT_LEVEL}, "runs.predictable": {LARGEST_GROWTH},
-        "decays.halves": {SIGNIFICANT, VISIBLE}, "friction.variants": {FACTOR}, "starts.agree": {0.0},
+        "decays.halves": {SIGNIFICANT, VISIBLE}, "friction.variants": {FACTOR, DOUBTFUL}, "starts.agree": {0.0},
         "springs.cantilever": {LEVEL, 3.0},
     }  # fmt: skip
     for code, numbers in said.items():
@@ -332,7 +332,7 @@ def test_a_number_that_must_not_be_quoted_is_named_in_the_verdict(unclean: Resul
 
 def test_a_shared_panel_has_the_level_of_its_checks(result: Result, drawn: tuple[Picture, ...]) -> None:
     """The friction panel belongs to no single table; a failed check of friction must not leave it marked ok."""
-    facts = {"labels": "s", "name": "eq. (1)", "factor": 165.0, "line": 'friction = "constant"'}
+    facts = {"labels": "s", "name": "eq. (1)", "factor": 165.0, "line": 'friction = "constant"', "shift": 0.2}
     for level, word in (("fail", "✗ failed"), ("ok", "✓ ok")):
         finding = Finding("friction.variants", level, facts | {"count": 3, "simplest": "eq. (1)"})
         text = Page(render(replace(result, findings=(finding,)), drawn)).text
