@@ -522,7 +522,7 @@ def _largest_input(result: Result, name: str) -> tuple[str, float]:
 
 def _factor(remaining: float) -> str:
     """By how much the sd falls where this part of the variance remains: a lower bound, since weights would adapt."""
-    return f"{max(remaining, 1e-4) ** -0.5:.2g}"
+    return f"{float(f'{max(remaining, 1e-4) ** -0.5:.2g}'):g}"
 
 
 # citation: What a paper or a thesis takes over from a result: the paper's reference and a LaTeX table. The template has

@@ -58,3 +58,9 @@ def test_the_tests_that_decide_the_widest_parameter_are_named(sourced: Result) -
 
 def test_nothing_is_advised_where_the_inputs_are_unknown(result: Result) -> None:
     assert not [heading for heading, _ in next_steps(result) if heading.startswith(("Weigh", "Measure", "Narrow"))]
+
+
+def test_a_factor_of_a_hundred_is_written_out(sourced: Result) -> None:
+    """Before: "at least 1e+02 times smaller"."""
+    shares = with_shares(sourced, k1={f"{STATED}m1": 0.99999})
+    assert "at least 100 times smaller" in dict(next_steps(shares))["Weigh m1 more precisely"]
