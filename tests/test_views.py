@@ -22,7 +22,7 @@ SEVERAL = {
     "{len(names)} parameters", "{samples} samples", "{len(values)} samples", "{records} records",
     "{rows} rows", "{count} friction laws",
     "{len(found.blocks)} blocks", "{len(found)} releases", "{len(several)} releases",
-    "{number} such panels", "{len(labels) - 8} others",
+    "{number} such tables", "{len(labels) - 8} others",
 }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, normal_force
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings
 from capsule_id.rig.toml import POSITIVE
-from capsule_id.views import Comparison, Curve, Finding, Message, Points, counted
+from capsule_id.views import Comparison, Curve, Facts, Finding, Message, Points, counted
 
 # declarations: Settings, columns, rules and messages that friction experiments share.
 
@@ -111,6 +111,23 @@ CAPTIONS = {
 #: A friction coefficient holds the viscous part as a force per weight.
 MASSES_OF_FREE = {"viscous": ("m1", "m2")}
 
+
+def _of_laws(facts: Facts) -> str:
+    """What the mean over the laws says, the readings that are missing, and the words that state a law."""
+    name, other = facts["name"], facts["other"]
+    more = "slides at higher speeds" if facts["slow"] else "slides at other speeds"
+    wider = (
+        f"{other} is {facts['other_factor']:.2g} times as probable and contains {name}: to fit it, write in [model] of "
+        f"rig.toml: {facts['other_line']}. "
+    )
+    return (
+        f"{facts['labels']}: expected readings that tell which friction law holds; the mean over the laws, by their "
+        f"probabilities, is {facts['means']}, and {name} alone gives {facts['now']}. Add "
+        f"{more if facts['tilts'] else 'tilts (static_friction)'}. {wider * (other is not None)}"
+        f"Where you know that {name} holds, write in [rig]: confirmed = [{facts['confirmed']}]"
+    )
+
+
 MESSAGES = {
     "friction.variants": Message(
         "friction law",
@@ -118,11 +135,7 @@ MESSAGES = {
             "the readings do not reject {name}: the best of {count} friction laws is {factor:.2g} times as probable. The "
             "simplest law that the readings cannot tell from the best is {simplest} (in [model]: {line})"
         ),
-        warn=(
-            "{labels}: too few readings choose a friction law. {other} is {other_factor:.2g} times as probable as {name}, and "
-            "the mean over {count} laws is {means} ({name} alone: {now}). Repeat the slides at more speeds, or write in "
-            "[model] of rig.toml: {other_line}. Where you know that {name} holds, write in [rig]: confirmed = [{confirmed}]"
-        ),
+        warn=_of_laws,
         fail=(
             "{labels}: expected readings that {name} explains; found them {factor:.3g} times more probable under another "
             "friction law. Write in [model] of rig.toml: {line}"

@@ -472,7 +472,8 @@ def _whole(
 def _held(record: _Record, begin: int, lengths: np.ndarray, sizes: np.ndarray) -> tuple[int, _Fit, float | None] | None:
     """As ``_whole``, where a hold comes before: the first sample that leaves the mean of those before it is free.
 
-    It lies behind the release, so that it needs no ``MARGIN``. The hold is where the decay turns: a clipped top is none.
+    The cut, ``MARGIN`` later than what this returns, is that sample. The hold is where the decay turns: a clipped top is
+    none.
     """
     means = np.cumsum(record.values)[:-1] / np.arange(1.0, len(record.values))
     left = np.abs(record.values[1:] - means) > SIGNIFICANT * record.noise
@@ -488,7 +489,7 @@ def _held(record: _Record, begin: int, lengths: np.ndarray, sizes: np.ndarray) -
     error = record.noise * np.sqrt(1.0 / first + 5.0 / len(motions))  # five unknowns
     if abs(np.hypot(x, v) - abs(means[first - 1] - level)) > SIGNIFICANT * error:
         return None
-    return record.at(record.time[first] - MARGIN * record.period), *whole[1:]
+    return max(record.at(record.time[first] - MARGIN * record.period) - 1, 0), *whole[1:]
 
 
 def _release(record: _Record, begin: int, early: int) -> tuple[int, _Fit, float | None]:

@@ -47,8 +47,8 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 _LONGEST = 80
 # Wider than this (CSS pixels) does not go in pairs.
 _HALF_PAGE = 650
-#: Panels of one kind that are drawn; of more, those whose readings fit worst.
-MOST_PANELS = 24
+#: Tables of one kind of panel that are drawn; of more, those whose readings fit worst.
+MOST_TABLES = 24
 #: Symbols of the sketch of the rig.
 SKETCHED = ("m1", "m2", "k1", "c", "k2", "G", "mu")
 
@@ -108,16 +108,17 @@ def drawings(result: Result) -> Iterator[Drawing]:
     labels = [
         item.label if item.label.startswith(item.kind) else f"{item.kind}_{item.label}" for item in result.comparisons
     ]
-    numbers, worst = Counter(item.kind for item in result.comparisons), worst_panels(result)
-    for name, item in zip(_unique(labels), result.comparisons, strict=True):
-        if item.label not in worst[item.kind]:
+    groups = [(item.kind, _group(result, item.label)) for item in result.comparisons]
+    numbers, worst = Counter(kind for kind, _ in {*groups}), worst_tables(result)
+    for name, item, (_, group) in zip(_unique(labels), result.comparisons, groups, strict=True):
+        if group not in worst[item.kind]:
             continue
         caption, figure = comparison_caption(item, result.registry.captions), figures.comparison_figure(item)
-        if (number := numbers[item.kind]) > MOST_PANELS:
+        if (number := numbers[item.kind]) > MOST_TABLES:
             caption += (
-                f" Drawn are the {MOST_PANELS} of {number} such panels that fit worst; plot_comparison draws any."
+                f" Drawn are the {MOST_TABLES} of {number} such tables that fit worst; plot_comparison draws any."
             )
-        yield name, "measured", item.title, caption, figure, comparison_alt(item), _group(result, item.label)
+        yield name, "measured", item.title, caption, figure, comparison_alt(item), group
     labels = _unique(record.name for record in result.records)
     for label, record in zip(labels, result.records, strict=True):
         yield from _drawings_of_record(record, label, _group(result, record.name))
@@ -147,20 +148,19 @@ def drawings(result: Result) -> Iterator[Drawing]:
     yield "point_fit_starts", "point_fit", "Starts of the point fit", caption, figure_of(ax), alt, ""
 
 
-def worst_panels(result: Result) -> dict[str, set[str]]:
-    """Labels of at most ``MOST_PANELS`` panels of each kind: first those with findings, then the least predictive p."""
+def worst_tables(result: Result) -> dict[str, set[str]]:
+    """Labels of the tables whose panels are drawn, by kind of panel: those with findings, then the largest misfits."""
     places = sorted(((_WORST_FIRST.index(one.level), one.experiment) for one in result.findings), reverse=True)
-    found = {label: place for place, label in places}
+    found, misfits = {label: place for place, label in places}, defaultdict[str, dict[str, float]](dict)
+    for item in result.comparisons:
+        label, own = _group(result, item.label), misfits[item.kind]
+        misfit = 0.0 if item.residuals is None else float(np.sqrt(np.mean(np.square(item.residuals))))
+        own[label] = max(own.get(label, 0.0), misfit)
 
-    def fits_worst(item: Comparison) -> tuple[int, float]:
-        p = 1.0 if item.predictive_p is None else item.predictive_p
-        return found.get(_group(result, item.label), len(_WORST_FIRST)), p
+    def worst(own: Mapping[str, float]) -> set[str]:
+        return {*sorted(own, key=lambda label: (found.get(label, len(_WORST_FIRST)), -own[label]))[:MOST_TABLES]}
 
-    worst = defaultdict[str, set[str]](set)
-    for item in sorted(result.comparisons, key=fits_worst):
-        if len(worst[item.kind]) < MOST_PANELS:
-            worst[item.kind].add(item.label)
-    return worst
+    return {kind: worst(own) for kind, own in misfits.items()}
 
 
 def _group(result: Result, label: str) -> str:

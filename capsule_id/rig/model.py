@@ -186,7 +186,7 @@ class Rig:
     model : the choices of ``[model]``
     slope, N0 : slope of the track, rad, and pressing force, N, of experiments that state no other (None: not stated)
     confirmed : names of masses, columns and settings whose unusual values are right: ``m1``, ``decay_1.x_rel``; "friction":
-        the law of ``model`` holds, whatever a comparison of laws says
+        the law of ``model`` holds, so that its values are judged where the readings do not tell it from others
     """
 
     name: str

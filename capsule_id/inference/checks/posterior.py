@@ -396,17 +396,19 @@ STATISTICS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def p_values(residuals: np.ndarray, columns: np.ndarray) -> dict[str, float]:
+def p_values(residuals: np.ndarray, columns: np.ndarray, number: int = 0) -> dict[str, float]:
     """Probability of each statistic of (n,) residuals in replicates; ties count half.
 
     Parameters
     ----------
     columns : (n, p) effect of the fitted parameters on the residuals
+    number : of replicates; 0: few, and more where these are too few for a small p-value
     """
     n, basis = len(residuals), basis_of(columns)
     # A reading with much leverage pulls the fit to itself: its residual is smaller than its error.
     spread = np.sqrt(np.maximum(1.0 - np.sum(basis**2, axis=1), 1e-3))
-    number = min(MOST_REPLICATES, max(FEWEST_REPLICATES, REPLICATED_READINGS // n))
+    most = REPLICATED_READINGS // n
+    number = number or min(MOST_REPLICATES, max(FEWEST_REPLICATES, most))
     noise = np.random.default_rng(0).standard_normal((number, n))
 
     def reduced(r: np.ndarray) -> np.ndarray:
@@ -426,8 +428,9 @@ def p_values(residuals: np.ndarray, columns: np.ndarray) -> dict[str, float]:
             # mean excess of a normal variable is 0.38 sd here.
             tail = np.sort(there)[-FARTHEST:]
             mean = max(float(np.mean(tail)) - tail[0], 0.3 * float(np.std(there)), np.finfo(float).tiny)
-            found[name] = FARTHEST / number * float(np.exp((tail[0] - here) / mean))
-    return found
+            found[name] = min(found[name], FARTHEST / number * float(np.exp((tail[0] - here) / mean)))
+    few = number < most and min(found.values()) < FEWEST_BEYOND / number
+    return p_values(residuals, columns, most) if few else found
 
 
 def experiment_p_values(e: Experiment, theta: Mapping[str, float]) -> dict[str, float]:

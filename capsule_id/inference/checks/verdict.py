@@ -248,7 +248,7 @@ def _boundary(s: SampledFit) -> list[Finding]:
 
 #: Fewest parts of the data, and most parts of one table.
 FEWEST_PARTS, MOST_PARTS = 4, 8
-#: Tests whose few parts are many.
+#: From more tests than this on, ``FEWEST_PARTS`` of each are enough.
 MANY_TESTS = 32
 #: Fewest rows of a part, relative to the number of unknowns of its experiment.
 ROWS_PER_UNKNOWN = 2

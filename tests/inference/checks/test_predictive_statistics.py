@@ -112,6 +112,14 @@ def test_p_values_beyond_the_replicates_are_not_too_small() -> None:
     assert max(p_values(slow, columns)[name] for name in ("sign runs", "trend")) < 1e-6
 
 
+def test_few_residuals_have_small_p_values_too() -> None:
+    """Their statistics are bounded, so that no exponential tail describes them. By 1e6 replicates: 1.1e-4 and 6.2e-4."""
+    columns = np.vander(np.linspace(-1.0, 1.0, 8), 2)
+    for seed, exact in ((2, 1.11e-4), (3, 6.22e-4)):
+        spike = 20.0 * (np.arange(8) == 4) + np.random.default_rng(seed).standard_normal(8)
+        assert p_values(spike, columns)["largest"] == pytest.approx(exact, rel=0.35)
+
+
 def test_of_many_tests_one_small_p_value_is_chance(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before: of 500 clean decays two failed, and the rig was not trusted."""
     tests = [SimpleNamespace(bench=True, event_driven=False, n=300, label=f"d{i}", local=dict) for i in range(40)]
