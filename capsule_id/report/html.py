@@ -47,7 +47,7 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 _LONGEST = 80
 # Wider than this (CSS pixels) does not go in pairs.
 _HALF_PAGE = 650
-#: Tables of one kind of panel that are drawn; of more, those whose readings fit worst.
+#: Tables of one kind of panel that are drawn; of more, those with findings or the largest residuals.
 MOST_TABLES = 24
 #: Symbols of the sketch of the rig.
 SKETCHED = ("m1", "m2", "k1", "c", "k2", "G", "mu")
@@ -116,7 +116,8 @@ def drawings(result: Result) -> Iterator[Drawing]:
         caption, figure = comparison_caption(item, result.registry.captions), figures.comparison_figure(item)
         if (number := numbers[item.kind]) > MOST_TABLES:
             caption += (
-                f" Drawn are the {MOST_TABLES} of {number} such tables that fit worst; plot_comparison draws any."
+                f" Drawn are the {MOST_TABLES} of {number} such tables with findings or the largest residuals; "
+                "plot_comparison draws any."
             )
         yield name, "measured", item.title, caption, figure, comparison_alt(item), group
     labels = _unique(record.name for record in result.records)
@@ -149,18 +150,18 @@ def drawings(result: Result) -> Iterator[Drawing]:
 
 
 def worst_tables(result: Result) -> dict[str, set[str]]:
-    """Labels of the tables whose panels are drawn, by kind of panel: those with findings, then the largest misfits."""
+    """Labels of the tables whose panels are drawn, by kind of panel: those with findings, then the largest residuals."""
     places = sorted(((_WORST_FIRST.index(one.level), one.experiment) for one in result.findings), reverse=True)
-    found, misfits = {label: place for place, label in places}, defaultdict[str, dict[str, float]](dict)
+    found, largest_of = {label: place for place, label in places}, defaultdict[str, dict[str, float]](dict)
     for item in result.comparisons:
-        label, own = _group(result, item.label), misfits[item.kind]
-        misfit = 0.0 if item.residuals is None else float(np.sqrt(np.mean(np.square(item.residuals))))
-        own[label] = max(own.get(label, 0.0), misfit)
+        label, own = _group(result, item.label), largest_of[item.kind]
+        largest = 0.0 if item.residuals is None else float(np.max(np.abs(item.residuals), initial=0.0))
+        own[label] = max(own.get(label, 0.0), largest)
 
     def worst(own: Mapping[str, float]) -> set[str]:
         return {*sorted(own, key=lambda label: (found.get(label, len(_WORST_FIRST)), -own[label]))[:MOST_TABLES]}
 
-    return {kind: worst(own) for kind, own in misfits.items()}
+    return {kind: worst(own) for kind, own in largest_of.items()}
 
 
 def _group(result: Result, label: str) -> str:

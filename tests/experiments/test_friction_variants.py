@@ -17,11 +17,12 @@ from capsule_id.experiments.friction_model import FrictionModel, model_lines
 from capsule_id.experiments.friction_variants import PARTICLES, PERMUTATIONS, VariantPoints, check_variants, fit_variant
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.statistics import of_neighbours, permutation_p
-from capsule_id.physics.forces import CoulombStribeck
+from capsule_id.physics.forces import CoulombStribeck, Force
 from capsule_id.report.messages import messages_of
 from capsule_id.rig.model import ModelChoices, Rig
 from capsule_id.views import Finding
 from tests.experiments import bench
+from tests.experiments.test_foreign_law import Hertz
 from tests.measured.folders import Entry, make_rig, note
 from tests.measured.sources import rack_friction
 
@@ -94,7 +95,13 @@ def test_a_free_ratio_is_recommended_where_the_data_have_one() -> None:
     assert (found.level, found.facts["line"]) == ("fail", 'free = ["ratio"]')
 
 
-def bench_twin(seed: int, ratio: float, model: ModelChoices = EQUATION_1, confirmed: tuple[str, ...] = ()) -> Finding:
+def bench_twin(
+    seed: int,
+    ratio: float,
+    model: ModelChoices = EQUATION_1,
+    confirmed: tuple[str, ...] = (),
+    contact: type[Force] | None = None,
+) -> Finding:
     """What the comparison finds on 8 tilts and 8 slides with a ``ratio`` of kinetic to static friction."""
     rng = np.random.default_rng(seed)
     mu, v_s, speed = rng.uniform(0.15, 0.7), 0.3 * 10.0 ** rng.uniform(-0.5, 0.4), rng.uniform(0.15, 1.0, 8)
@@ -104,7 +111,7 @@ def bench_twin(seed: int, ratio: float, model: ModelChoices = EQUATION_1, confir
     slides = bench.table("sliding_friction", [bench.column("speed", speed), bench.column("coefficient", coefficient)])
     tilts = bench.table("static_friction", [bench.column("angle", angle)])
     rig = dataclasses.replace(bench.rig(slides, tilts), model=model, confirmed=confirmed)
-    made = [e for e in make_experiments(rig) if isinstance(e, FrictionExperiment)]
+    made = [e for e in make_experiments(rig, contact=contact) if isinstance(e, FrictionExperiment)]
     return findings(made)["friction.variants"]
 
 
@@ -121,6 +128,9 @@ def test_a_law_that_few_readings_choose_is_in_doubt() -> None:
     assert bench_twin(DOUBTED, 0.8, ModelChoices(free=("ratio",))).level == "ok"
     assert bench_twin(DOUBTED, 0.8, confirmed=("friction",)).level == "ok"
     assert bench_twin(DOUBTED, 0.5).level == "ok"
+    # A contact is no other friction law: before, the law in use stood beside itself.
+    beside = bench_twin(DOUBTED, 0.8, contact=Hertz)
+    assert (beside.level, beside.facts["shift"]) == ("warn", found.facts["shift"])
 
 
 @pytest.mark.slow
