@@ -490,7 +490,7 @@ def read_confirmed(root: Node, tables: Sequence[Table[Any]], stated: Iterable[st
     node = root["rig"].get("confirmed", [])
     known = ["friction", *stated, *(f"{t.label}.{name}" for t in tables for name in (*t.columns, *vars(t.settings)))]
     node.require(isinstance(node.value, list), "be a list of names", 'write confirmed = ["m1"]')
-    rule = "friction, quantities of [rig], or LABEL.COLUMN or LABEL.SETTING of experiments"
+    rule = "quantities of [rig], friction, or LABEL.COLUMN or LABEL.SETTING of experiments"
     return tuple(read_words(node, known, rule, "remove it"))
 
 
