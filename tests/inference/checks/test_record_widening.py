@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -36,6 +37,30 @@ from tests.inference.stub import plain_jacobian, plain_residuals
 from tests.measured.folders import Entry, make_rig, quantity
 
 NO_ARRAY = np.zeros(0)
+
+
+@pytest.mark.parametrize(("tests", "numbers"), [(2, {4, 8}), (40, {4})])
+def test_few_tests_are_divided_twice_and_many_once(
+    tests: int, numbers: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before: of 500 decays 6,000 parts were fitted. The widest interval of both divisions counts."""
+    asked = set[int]()
+
+    def parts(_: object, __: object, number: int, by_load: bool) -> list[tuple[str, tuple[float, float]]]:
+        asked.add(number)
+        return [("k2", (10.0 + number * side, 1.0)) for side in (-1.0, 1.0)]
+
+    monkeypatch.setattr(verdict, "estimates_of_parts", parts)
+    made = [
+        SimpleNamespace(label=f"s{i}", kind="spring", bench=True, event_driven=False, parameters=())
+        for i in range(tests)
+    ]
+    for e in made:
+        e.table = e
+    s = SimpleNamespace(findings=[Finding("lines.straight", "fail", {}, "s0")], experiments=made, values={})
+    (one,) = verdict.widenings(cast(SampledFit, s)).values()
+    assert asked == numbers
+    assert one.factor == pytest.approx(max(numbers) * np.sqrt(2 * tests / (2 * tests - 1)))
 
 
 @cache
