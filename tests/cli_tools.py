@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +31,17 @@ sys.exit({name}())
 def argv(*words: str, name: str = "fit_params", before: str = "") -> list[str]:
     """The command line of a command of this checkout; ``before`` is Python code that runs first."""
     return [sys.executable, "-c", before + CODE.format(name=name), *words]
+
+
+def peak_memory(command: list[str], what: str) -> float:
+    """Run a command; its peak memory, MB, which is printed with its time."""
+    code = f"import resource, subprocess\nsubprocess.run({command!r}, check=True)\n"
+    code += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    begin = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment())
+    kilobytes = float(done.stdout.split()[-1]) / (1.0 if sys.platform == "linux" else 1024.0)
+    print(f"{what}: {time.perf_counter() - begin:.1f} s, {kilobytes / 1e3:.0f} MB")
+    return kilobytes / 1e3
 
 
 def environment(**changes: str | None) -> dict[str, str]:

@@ -229,10 +229,10 @@ def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:
 FEWEST_SLIDES, SEED = 3, 0
 
 
-def _doubt(variants: Sequence[Variant], used: Variant) -> tuple[list[Parameter], dict[str, Any]]:
+def _doubt(variants: Sequence[Variant], used: Variant, fastest: float) -> tuple[list[Parameter], dict[str, Any]]:
     """Parameters that the mean over the laws moves by ``DOUBTFUL`` sd (Hoeting et al. 1999), and the facts of its words.
 
-    The mean is over the laws that have the parameter, by their probabilities.
+    The mean is over the laws that have the parameter, by their probabilities. ``fastest``: largest speed of a slide, m/s.
     """
     means = {}
     for name in used.values.keys() | {"v_s"}:
@@ -248,7 +248,7 @@ def _doubt(variants: Sequence[Variant], used: Variant) -> tuple[list[Parameter],
         "other": None if other is used else other.model.name,
         "other_line": model_lines(other.model),
         "other_factor": float(np.exp(np.clip(other.evidence - used.evidence, -700.0, 700.0))),
-        "mean_v_s": means["v_s"],
+        "slow": fastest < FAST * means["v_s"],
         "shift": max(shifts.values()),
         "means": ", ".join(f"{row.name} = {means[row.symbol]:.3g}" for row in moved),
         "now": ", ".join(f"{row.name} = {used.values[row.symbol]:.3g} ± {used.sds[row.symbol]:.2g}" for row in moved),
@@ -272,7 +272,7 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
     highest = max(variant.evidence for variant in variants)
     used = next(variant for variant in variants if variant.model == in_use)
     simplest = next(variant for variant in variants if highest - variant.evidence < np.log(TELLING))
-    (moved, doubt), rig = _doubt(variants, used), experiments[0].rig
+    (moved, doubt), rig = _doubt(variants, used, float(np.max(points.speed))), experiments[0].rig
     facts = {
         "name": in_use.name,
         "labels": ", ".join(e.label for e in experiments),
@@ -283,7 +283,6 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
         "p": used.lack_of_fit,
         **doubt,
         "tilts": any(e.role == "static" for e in experiments),
-        "slow": float(np.max(points.speed)) < FAST * doubt["mean_v_s"],
         "confirmed": ", ".join(f'"{name}"' for name in (*rig.confirmed, "friction")),
     }
     names = tuple(row.name for row in in_use.parameters)

@@ -478,7 +478,7 @@ def _held(record: _Record, begin: int, lengths: np.ndarray, sizes: np.ndarray) -
     means = np.cumsum(record.values)[:-1] / np.arange(1.0, len(record.values))
     left = np.abs(record.values[1:] - means) > SIGNIFICANT * record.noise
     first = 1 + int(np.argmax(left))
-    if not WINDOW // 4 < first < begin:
+    if first >= begin:
         return None
     after = replace(record, time=record.time[first:], values=record.values[first:])
     if (whole := _whole(after, begin - first, lengths, sizes)) is None:

@@ -6,13 +6,12 @@ TEXT_MB=1000 python -m pytest tests/benchmarks/test_long_text.py -m benchmark -s
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.cli_tools import argv, environment
+from tests.cli_tools import argv, peak_memory
 
 pytestmark = pytest.mark.benchmark
 
@@ -55,17 +54,6 @@ def write(folder: Path) -> Path:
     return folder / "d.csv"
 
 
-def peak(folder: Path) -> float:
-    """Peak memory of ``capsule-id check``, MB; it also prints the time."""
-    code = f"import resource, subprocess, sys\nsubprocess.run({argv('check', str(folder), name='capsule_id')!r}, check=True)\n"
-    code += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
-    begin = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment())
-    kilobytes = float(done.stdout.split()[-1]) / (1.0 if sys.platform == "linux" else 1024.0)
-    print(f"check {folder.name}: {time.perf_counter() - begin:.1f} s, {kilobytes / 1e3:.0f} MB")
-    return kilobytes / 1e3
-
-
 def cpu(path: Path, statement: str) -> float:
     """CPU seconds of a statement about the file."""
     words = [sys.executable, "-c", READ.format(statement), str(path)]
@@ -75,7 +63,7 @@ def cpu(path: Path, statement: str) -> float:
 def test_a_long_text(tmp_path: Path) -> None:
     text = write(tmp_path)
     ours, pandas = cpu(text, OURS), cpu(text, 'pandas.read_csv(path, engine="pyarrow")')
-    resident = peak(tmp_path)
+    resident = peak_memory(argv("check", str(tmp_path), name="capsule_id"), "check")
     print(f"{text.stat().st_size / 1e6:.0f} MB: reading {ours:.1f} s, pandas {pandas:.1f} s")
     assert resident < EMPTY_MB + MOST_MEMORY * SIZE_MB
     assert ours < MOST_TIME * pandas

@@ -5,15 +5,12 @@ DECAYS=500 python -m pytest tests/benchmarks/test_many_decays.py -m benchmark -s
 
 import json
 import os
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.cli_tools import argv, environment
+from tests.cli_tools import argv, peak_memory
 
 pytestmark = pytest.mark.benchmark
 
@@ -38,22 +35,12 @@ def write(folder: Path, hold: float) -> None:
     (folder / "rig.toml").write_text("\n".join(lines), encoding="utf-8")
 
 
-def run(command: list[str], what: str) -> None:
-    """Run a command; print its time and peak memory."""
-    code = f"import resource, subprocess\nsubprocess.run({command!r}, check=True)\n"
-    code += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
-    begin = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment())
-    kilobytes = float(done.stdout.split()[-1]) / (1.0 if sys.platform == "linux" else 1024.0)
-    print(f"{what}: {time.perf_counter() - begin:.1f} s, {kilobytes / 1e3:.0f} MB")
-
-
 @pytest.mark.parametrize("hold", [0.0, 0.2])
 def test_many_decays(tmp_path: Path, hold: float) -> None:
     (rig := tmp_path / "rig").mkdir()
     write(rig, hold)
-    run(argv("check", str(rig), name="capsule_id"), f"check of {DECAYS} decays, hold {hold} s")
-    run(argv(str(rig), "--quiet", "--out", str(tmp_path / "out")), f"fit of {DECAYS} decays, hold {hold} s")
+    peak_memory(argv("check", str(rig), name="capsule_id"), f"check of {DECAYS} decays, hold {hold} s")
+    peak_memory(argv(str(rig), "--quiet", "--out", str(tmp_path / "out")), f"fit of {DECAYS} decays, hold {hold} s")
     found = json.loads((tmp_path / "out" / "parameters.json").read_text(encoding="utf-8"))
     assert {one["trust"] for one in found["parameters"].values()} == {"trusted"}
     assert abs(found["parameters"]["k1"]["value"] - K1) < 3.0 * found["parameters"]["k1"]["sd"]

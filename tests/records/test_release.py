@@ -221,6 +221,16 @@ def test_no_release_is_looked_for_in_a_viscous_decay(held: int, before: float, m
     assert found.period == pytest.approx(0.5, rel=0.02)
 
 
+@pytest.mark.parametrize(("held", "samples", "seed"), [(2, 30, 0), (3, 100, 0), (5, 20, 0)])
+def test_a_hold_of_a_few_samples_is_left_out(held: int, samples: int, seed: int) -> None:
+    """``held`` samples of a decay with 5 % of damping and 0.5 % of noise; the start was inside holds as short as these."""
+    time, rng = np.arange(6 * samples) / samples, np.random.default_rng(seed)
+    since = 2.0 * np.pi * np.maximum(time - held / samples, 0.0)
+    values = np.exp(-0.05 * since) * (np.cos(since) + 0.05 * np.sin(since)) + 0.005 * rng.standard_normal(len(time))
+    found = cast(FreeDecay, find_free_decay(time, values, displacement=True))
+    assert -1e-9 <= found.start - held / samples <= 0.1
+
+
 @pytest.mark.parametrize(("zeta", "poles"), [(0.0, 1), (0.05, 1), (1.0, 2), (1.3, 2)])
 def test_a_column_costs_one_wave_of_two_conjugate_ones(zeta: float, poles: int) -> None:
     """Before: both were computed, and real ones as complex numbers. The columns of the poles are derivatives."""
