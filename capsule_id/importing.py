@@ -15,6 +15,7 @@ from capsule_id.records.release import find_free_decay, find_releases
 from capsule_id.records.tones import estimate_clock, frequency_of
 from capsule_id.rig.filters import FEWEST_SAMPLES, clock_starts
 from capsule_id.rig.formats import TEXTS
+from capsule_id.rig.formats.binary import sheets_of
 from capsule_id.rig.formats.layouts import delimiter_of
 from capsule_id.rig.formats.raw import NO_READING, TextFile
 from capsule_id.rig.guess import (
@@ -315,7 +316,8 @@ def read_file(path: Path) -> bytes:
 def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
     """The lines of ``[[experiment]]`` for one export, and the guess; without a guess the lines are comments.
 
-    A workbook has such lines for each of its sheets with numbers, and the guess is that of the first one.
+    A workbook has such lines for each of its sheets with numbers, an interrupted text for each of its long blocks. The guess
+    is that of the first ones.
 
     Parameters
     ----------
@@ -327,25 +329,28 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
     InputError
         If the file cannot be read.
     """
-    dimensions = dimensions_of(kinds)
-    try:
-        found = find_layout(content, path, dimensions)
-    except InputError as error:
-        by_hand = f"{error.remedy}, in the entry that you write: capsule-id init DIR makes a rig.toml with examples"
-        remedy = by_hand if any(f"{key} = " in error.remedy for key in LAYOUT) else error.remedy
-        raise InputError(error.rule, error.value, remedy, error.file, error.line, error.column) from None
-    guessed, others = guess(found, kinds), found.export.others
-    if others:
-        found = replace(found, layout=replace(found.layout, sheet=found.export.sheet))
-    entries = [_entry(found, guessed, content, kinds)]
-    for sheet in others:
+    entries, guesses, faults = list[str](), list[Guess | None](), list[InputError]()
+    parts: list[tuple[str | None, tuple[int, int] | None]] = [
+        (sheet, None) for sheet in sheets_of(content, path) or (None,)
+    ]
+    for sheet, block in parts:  # it grows by the further blocks of a text
         try:
-            other = find_layout(content, path, dimensions, sheet)
+            found = find_layout(content, path, dimensions_of(kinds), sheet, block)
         except InputError as error:
+            faults.append(error)
             entries.append(f"#: Sheet {sheet!r} is not read: {error.rule}, {' '.join(error.value.split())}.\n")
         else:
-            entries.append(_entry(other, guess(other, kinds), content, kinds))
-    return "\n".join(entries), guessed
+            guesses.append(guess(found, kinds))
+            entries.append(_entry(found, guesses[-1], content, kinds))
+            used = (found.layout.data_from_line, found.layout.data_to_line)
+            long = [one for one in found.blocks if one[1] - one[0] > FEWEST_SAMPLES and one != used]
+            parts += [(sheet, one) for one in long if block is None]
+    if not guesses:
+        error = faults[0]
+        by_hand = f"{error.remedy}, in the entry that you write: capsule-id init DIR makes a rig.toml with examples"
+        remedy = by_hand if any(f"{key} = " in error.remedy for key in LAYOUT) else error.remedy
+        raise InputError(error.rule, error.value, remedy, error.file, error.line, error.column)
+    return "\n".join(entries), guesses[0]
 
 
 def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Mapping[str, Kind]) -> str:
@@ -430,18 +435,17 @@ def _description(found: FoundLayout, content: bytes) -> str:
 def _layout_lines(found: FoundLayout) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
     used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
-    label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{found.export.path.stem}_{used.sheet}") if used.sheet else None
+    part = used.sheet or (used.data_from_line if len(found.blocks) > 1 else None)
+    label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{found.export.path.stem}_{part}") if part else None
     codes = [text for text in used.missing if text not in NO_READING]
-    longest = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
-    # A record that a line of text interrupts is no record and a footer.
-    parted = sorted(last - first for first, last in found.blocks)[-2:-1] > [FEWEST_SAMPLES]
+    one = f"the end of one of {len(found.blocks)} blocks of readings, lines {blocks}"
     for key, value, confidence, reason in (
         ("data_from_line", used.data_from_line, "sure", "the first row of readings"),
         (
             "data_to_line",
             used.data_to_line,
-            "unsure" if parted else "likely",
-            f"{longest}; the others are not read" if len(found.blocks) > 1 else "the last row of readings",
+            "likely",
+            f"{one}; short ones are not read" if len(found.blocks) > 1 else "the last row of readings",
         ),
         ("missing", codes or None, "likely", "far from all other numbers of their column: codes for no reading"),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),

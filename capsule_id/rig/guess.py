@@ -57,6 +57,7 @@ WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, wor
     "thrust tension effort empuje spinta schub",
     "normal_force": "normal normalkraft normale fn load weight last auflast gewicht charge poids carga peso "
     "carico anpresskraft",
+    "mass": "mass masse masa massa",
     "angle": "angle tilt winkel inclination incline slope neigung steigung theta alpha angulo angolo "
     "inclinaison inclinacion inclinazione pente pendiente pendenza ang phi θ α φ",
     "height": "height hoehe hohe h hauteur altura altezza rise elevation",
@@ -156,6 +157,7 @@ def fits_name(name: str, column: str) -> float:
     if bare == column.lower():
         return 3
     known = WORDS.get(SAME.get(column, column), ())
+    words = [word if word in known else word.rstrip("0123456789") or word for word in words]  # x1 is one x of several
     if any(word in (*words, *map("".join, pairwise(words))) for word in known):  # F_N is FN
         return 2.5 if set(words) <= set(known) or "".join(words) in known else 2
     heads = (word for word in known if len(word) >= SHORTEST_HEAD or word in SHORT_HEADS)
@@ -216,7 +218,7 @@ class FoundLayout:
     rate : sampling rate that the file states, Hz
     stamps : indices of the columns of time stamps, in seconds since the first one
     blocks : first and last line of each block of readings, counted from 1, of a text with other lines between or below
-        them, of which ``export`` holds the longest; else ()
+        them, of which ``export`` holds one; else ()
     labels : index of a column of ``unread`` that tells directions or surfaces apart -> its texts
     """
 
@@ -241,7 +243,13 @@ class FoundLayout:
         return name, factor[0] if factor else (text or self.units[index]).strip()
 
 
-def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: str | None = None) -> FoundLayout:
+def find_layout(
+    content: bytes,
+    path: Path,
+    dimensions: Sequence[str],
+    sheet: str | None = None,
+    block: tuple[int, int] | None = None,
+) -> FoundLayout:
     """The layout of a file of a known format.
 
     Parameters
@@ -250,6 +258,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
     path : its name
     dimensions : SI units of all columns of all kinds
     sheet : of a workbook (None: the first one with numbers)
+    block : first and last line of the block of readings of an interrupted text (None: the longest one)
 
     Raises
     ------
@@ -282,7 +291,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str], sheet: st
         if not blocks:
             raise
     if blocks:  # what was read before is free by now
-        first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
+        first, last = block or max(blocks, key=lambda lines: lines[1] - lines[0])
         layout = replace(layout, data_from_line=first, data_to_line=last)
         export, (columns, singles, unread) = read(layout)
     if (other := no_readings(export, layout, [*columns.values()])[1]) != layout:
@@ -382,12 +391,6 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
                 columns, _, unread = _readings(export)
                 if not columns and unread:
                     raise unread[min(unread)]
-                if columns and len(export.lines) == 1:
-                    rule, remedy = (
-                        "an export must have two rows of numbers or more",
-                        "export all readings into one file",
-                    )
-                    raise InputError(rule, "one row", remedy, path, int(export.lines[0]))
                 if any(np.isfinite(values[0]) for values in columns.values()):
                     runs, longest = _runs([beginning], layout) if line is not None else ([], None)
                     if any(run[2] < (line or 0) for run in runs if longest is not None and run[0] == longest):
@@ -397,7 +400,13 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
 
 
 def _readings(export: Export) -> Readings:
-    """The columns of readings, all of the most frequent length; the columns of one number; errors of all others."""
+    """The columns of readings, all of the most frequent length; the columns of one number; errors of all others.
+
+    Raises
+    ------
+    InputError
+        If the file has one row.
+    """
     columns: dict[int, np.ndarray] = {}
     singles: dict[int, float] = {}
     unread: dict[int, InputError] = {}
@@ -411,6 +420,9 @@ def _readings(export: Export) -> Readings:
             singles[column] = float(values[0])
         if values.size and np.mean(np.isnan(values)) <= MOST_MISSING:
             columns[column] = values
+    if columns and len(export.lines) == 1:
+        rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
+        raise InputError(rule, "one row", remedy, *export.place(0, 0)[:2])
     sizes = [values.size for values in columns.values()]
     common = max(sizes, key=lambda size: (sizes.count(size), size), default=0)
     common = max(sizes) if common == 1 else common
@@ -728,7 +740,12 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     constant = is_constant(found, index)
     named, meant = fits_name(stem, name), meaning(stem, name, kind.meant)
     said, missing = f"the file says {found.names[index]!r}", "the file states no unit"
-    if (text and unit is None) or named < 0 or (constant and rule.varies):
+    if named < 0 or (constant and rule.varies):
+        return None
+    mass = unit_of(text, ["kg"]) if name == "force" and "normal_force" not in kind.columns else None
+    if mass in ("kg", "g", "lb") and (named or fits_name(stem, "mass") > 0):
+        return named or 1.0, ColumnGuess(index, f"{mass}f", "unsure", f"{said}: the weight, if this mass hangs there")
+    if text and unit is None:
         return None
     below = unit_of(found.units[index], [rule.si])
     if unit and below and factor_to_si(unit, rule.si) != factor_to_si(below, rule.si):  # um is µm

@@ -60,15 +60,16 @@ def test_the_remedy_for_a_block_that_ends_reads_it(tmp_path: Path) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("packed", [False, True])
-def test_import_reads_the_longest_block_and_names_all(tmp_path: Path, packed: bool) -> None:
+def test_import_reads_the_longest_block_first_and_names_all(tmp_path: Path, packed: bool) -> None:
     text = block(1, 70) + "\n" + block(2, 80)
     # A long first block: the titles of the second one lie beyond the beginning that the layout is found from.
     text = text if not packed else text.replace("\n\nInstrument", "\n" * 120_000 + "Instrument")
     (tmp_path / "steps.csv").write_text(text, encoding="utf-8")
     proposed = capsule_id.propose_entry(tmp_path / "steps.csv")
-    assert "the end of the longest of 2 blocks of readings, lines 9 to 78, " in proposed
-    (table,) = rig(tmp_path, text, proposed).tables
-    assert (len(table.rows), table["x_rel"][0]) == (80, 2e-3)
+    assert proposed.count("the end of one of 2 blocks of readings, lines 9 to 78, ") == 2
+    longest, other = rig(tmp_path, text, proposed).tables
+    assert (len(longest.rows), longest["x_rel"][0]) == (80, 2e-3)
+    assert (len(other.rows), other["x_rel"][0]) == (70, 1e-3)
 
 
 def test_import_of_a_second_table_with_the_same_headers(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The import assistant on headers of angles, headers in quotation marks, records in time, and columns alike."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -226,17 +227,46 @@ def test_a_factor_in_a_header_leaves_the_unit_open(tmp_path: Path, header: str) 
         assert f'from = "{name}", unit = "{unit}"' in capsule_id.importing.propose_entry(tmp_path / "d.csv")
 
 
-def test_a_record_that_a_line_interrupts_is_unsure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Before: "likely", and 400 rows with the release were lost without a word. Control: a footer of three rows."""
-    for last, words in ((400, ", unsure"), (897, "")):
+def test_each_block_of_a_record_that_a_line_interrupts_has_an_entry(tmp_path: Path) -> None:
+    """Before: 400 rows with the release were read by no entry. Control: a footer of three rows is none."""
+    for last, lines in ((400, [(403, 902), (2, 401)]), (897, [(2, 898)])):
         text = swing(range(last)) + "buffer overrun\n" + swing(range(last, 900), "")
         (tmp_path / "d.csv").write_text(text, encoding="utf-8")
+        entry = capsule_id.propose_entry(tmp_path / "d.csv")
+        found = re.findall(r"^data_from_line = (\d+) .*\ndata_to_line = (\d+)", entry, re.MULTILINE)
+        assert [(int(first), int(end)) for first, end in found] == lines
+        assert entry.count('kind = "free_vibration"') == len(lines)
         folder = tmp_path / f"rig_{last}"
-        assert cli.capsule_id(["init", str(folder), "--from", str(tmp_path / "d.csv")]) == 0
-        assert f"d.csv: free_vibration{words}\n" in capsys.readouterr().out
-        assert ("unsure: the end of the longest of 2" in (folder / "rig.toml").read_text(encoding="utf-8")) == bool(
-            words
-        )
+        assert cli.capsule_id(["init", str(folder), "--m1", "110", "1", "g", "--from", str(tmp_path / "d.csv")]) == 0
+        rig = capsule_id.read_rig(folder)
+        assert sum(len(table["time"]) for table in rig.tables) == sum(end - first + 1 for first, end in lines)
+
+
+def test_masses_that_hang_from_a_spring_are_offered_as_its_force(tmp_path: Path) -> None:
+    """Before: no kind. Control: beside a pull they are no force, and a mass alone is no spring."""
+    rows = [f"{100 * k};{1.5 * k:.1f}" for k in range(1, 7)]
+    for header, line in (
+        ("Mass (g);Displacement (mm)", 'columns.force = { from = "Mass (g)", unit = "gf" }  # unsure'),
+        ("Masse [kg];Federweg [mm]", 'columns.force = { from = "Masse [kg]", unit = "kgf" }  # unsure'),
+        ("Mass (g);Pull force (N)", 'columns.force = { from = "Pull force (N)", unit = "N" }'),
+        ("Mass (g);Temperature (C)", "# [[experiment]]"),
+    ):
+        (tmp_path / "s.csv").write_text("\n".join([header, *rows, ""]), encoding="utf-8")
+        entry = capsule_id.propose_entry(tmp_path / "s.csv")
+        assert line in entry
+        assert ('kind = "support_spring"' in entry) == ("f" in line[-20:] and "unsure" in line)
+
+
+def test_numbered_names_are_names(tmp_path: Path) -> None:
+    """Before: no kind. Two motions side by side are asked about, equal times are not."""
+    rows = "".join(
+        f"{5e-4 * k:.4f},{np.cos(0.06 * k):.4f},{5e-4 * k:.4f},{2 * np.cos(0.06 * k):.4f}\n" for k in range(900)
+    )
+    (tmp_path / "d.csv").write_text(f"t1 (s),x1 (mm),t2 (s),x2 (mm)\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "d.csv")
+    assert '\ncolumns.time = { from = "t1 (s)", unit = "s" }  # sure' in entry
+    for name in ("x1 (mm)", "x2 (mm)"):
+        assert f'\n# columns.x_rel = {{ from = "{name}", unit = "mm" }}' in entry
 
 
 def test_a_cell_that_stops_a_column_leaves_the_kind_open(tmp_path: Path) -> None:

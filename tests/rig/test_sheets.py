@@ -52,6 +52,24 @@ def test_each_sheet_with_a_table_gets_an_entry(tmp_path: Path, capsys: pytest.Ca
         np.testing.assert_allclose(table["x_rel"], decay(size), atol=1e-12)
 
 
+def test_a_sheet_of_notes_that_comes_first_is_named(tmp_path: Path) -> None:
+    """Before: no entry for any sheet. The remedy of the error without ``sheet`` works."""
+    with xlsxwriter.Workbook(tmp_path / "rig A.xlsx") as made:
+        made.add_worksheet("Notes").write_row(0, 0, ["mass (g)", 110.5])
+        made.add_worksheet("Year").write_column(0, 0, ["year", 2026])
+        sheet = made.add_worksheet("soft pull")
+        sheet.write_row(0, 0, ["Time (s)", "Disp (mm)"])
+        for row, pair in enumerate(zip(TIME, decay(2.0), strict=True), start=1):
+            sheet.write_row(row, 0, pair)
+    entry = cid.propose_entry(tmp_path / "rig A.xlsx")
+    assert [f"#: Sheet '{name}' is not read: " in entry for name in ("Notes", "Year")] == [True, True]
+    assert 'sheet = "soft pull"  # sure' in entry
+    assert entry.count("[[experiment]]") == 1
+    with pytest.raises(InputError, match='or sheet = "Year" or "soft pull", if that holds the readings'):
+        cid.read_rig(rig_of(tmp_path, ""))
+    np.testing.assert_allclose(cid.read_rig(rig_of(tmp_path, 'sheet = "soft pull"')).tables[0]["x_rel"], decay(2e-3))
+
+
 def rig_of(folder: Path, line: str, file: str = "rig A.xlsx") -> Path:
     columns = '{ time = { from = "Time (s)", unit = "s" }, x_rel = { from = "Disp (mm)", unit = "mm" } }'
     (folder / "rig.toml").write_text(

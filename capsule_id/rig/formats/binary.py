@@ -459,7 +459,9 @@ def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
     try:
         export = read_text("\n".join(lines).encode(), path, layout)
     except InputError as error:
-        raise _in_sheet(error, lines) from None
+        known = " or ".join(json.dumps(name, ensure_ascii=False) for name in others)
+        more = f", or sheet = {known}, if that holds the readings" if others and not layout.sheet else ""
+        raise _in_sheet(error, lines, more) from None
 
     def values(column: int) -> np.ndarray:
         try:
@@ -504,6 +506,21 @@ def _lines_of_book(content: bytes, path: Path, chosen: str | None) -> tuple[list
     return lines, name, tuple(others)
 
 
+def sheets_of(content: bytes, path: Path) -> tuple[str, ...]:
+    """The sheets with numbers of a workbook, where it has several; () of any other file.
+
+    Raises
+    ------
+    InputError
+        If openpyxl is not installed, or the file is damaged or too large.
+    """
+    if path.suffix.lower() != ".xlsx":
+        return ()
+    require("openpyxl", path)
+    _, first, others = _lines_of_book(content, path, None)
+    return (first, *others) if others else ()
+
+
 def _too_many(path: Path) -> InputError:
     return InputError(
         f"a sheet must have at most {MOST_CELLS} cells", "more", "export the record as CSV or Parquet", path
@@ -527,9 +544,9 @@ def _rows(sheet: Any, path: Path) -> tuple[list[list[str]], bool]:
     return rows, numbers
 
 
-def _in_sheet(error: InputError, lines: list[str]) -> InputError:
-    """The error with the column of the sheet instead of the character of the line."""
+def _in_sheet(error: InputError, lines: list[str], more: str = "") -> InputError:
+    """The error with the column of the sheet instead of the character of the line, and ``more`` of a remedy."""
     if error.line is None or error.line > len(lines):
         return error
     column = lines[error.line - 1][: (error.column or 1) - 1].count("\t") + 1
-    return InputError(error.rule, error.value, error.remedy, error.file, error.line, column)
+    return InputError(error.rule, error.value, error.remedy + more, error.file, error.line, column)
