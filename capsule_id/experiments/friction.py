@@ -22,7 +22,7 @@ from capsule_id.physics.forces import CoulombStribeck, FrictionLaw, normal_force
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings
 from capsule_id.rig.toml import POSITIVE
-from capsule_id.views import Comparison, Curve, Facts, Finding, Message, Points, counted
+from capsule_id.views import Comparison, Curve, Facts, Finding, Message, Points, counted, filled_in
 
 # declarations: Settings, columns, rules and messages that friction experiments share.
 
@@ -103,8 +103,8 @@ def lint_slides(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 
 CAPTIONS = {
     "friction": (
-        "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours. Pushes stand at "
-        "what they mean at their speed, too."
+        "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours. A push stands "
+        "twice: as the paper reads it, v²/(2 g d) from its distance d, and at the coefficient that d means at its speed v."
     )
 }
 
@@ -121,20 +121,20 @@ def _of_laws(facts: Facts) -> str:
         f"rig.toml: {facts['other_line']}. "
     )
     return (
-        f"{facts['labels']}: expected readings that tell which friction law holds; the mean over the laws, by their "
-        f"probabilities, is {facts['means']}, and {name} alone gives {facts['now']}. Add "
+        f"{facts['labels']}: which friction law holds is not known from these readings. The mean over the laws, by their "
+        f"probabilities, is {facts['means']}; {name} alone gives {facts['now']}. To decide, add "
         f"{more if facts['tilts'] else 'tilts (static_friction)'}. {wider * (other is not None)}"
         f"Where you know that {name} holds, write in [rig]: confirmed = [{facts['confirmed']}]"
     )
 
 
+_BEST = "the readings do not reject {name}: the best of {count} friction laws is {factor:.2g} times as probable. "
+_NONE = "the readings do not reject {name}: none of {count} friction laws is more probable. "
+_SIMPLEST = "The simplest law that the readings cannot tell from the best is {simplest} (in [model]: {line})"
 MESSAGES = {
     "friction.variants": Message(
         "friction law",
-        ok=(
-            "the readings do not reject {name}: the best of {count} friction laws is {factor:.2g} times as probable. The "
-            "simplest law that the readings cannot tell from the best is {simplest} (in [model]: {line})"
-        ),
+        ok=lambda facts: filled_in((_BEST if facts["factor"] > 1.05 else _NONE) + _SIMPLEST, facts),
         warn=_of_laws,
         fail=(
             "{labels}: expected readings that {name} explains; found them {factor:.3g} times more probable under another "

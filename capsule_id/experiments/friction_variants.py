@@ -14,7 +14,7 @@ from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.experiments.statistics import of_neighbours, permutation_p
 from capsule_id.parameters import QUANTILE_975, SAME, Parameter, Prior
 from capsule_id.physics.forces import CoulombStribeck
-from capsule_id.views import Finding, Level
+from capsule_id.views import Finding, Level, after_number
 
 # friction variants: Variants of the friction law, compared by their marginal likelihoods on the friction experiments.
 #
@@ -250,7 +250,7 @@ def _doubt(variants: Sequence[Variant], used: Variant, fastest: float) -> tuple[
         "other_factor": float(np.exp(np.clip(other.evidence - used.evidence, -700.0, 700.0))),
         "slow": fastest < FAST * means["v_s"],
         "shift": max(shifts.values()),
-        "means": ", ".join(f"{row.name} = {means[row.symbol]:.3g}" for row in moved),
+        "means": ", ".join(f"{row.name} = {means[row.symbol]:.3g}{after_number(row.unit)}" for row in moved),
         "now": ", ".join(f"{row.name} = {used.values[row.symbol]:.3g} ± {used.sds[row.symbol]:.2g}" for row in moved),
     }
 

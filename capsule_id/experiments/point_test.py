@@ -240,7 +240,7 @@ LINE_MESSAGES = {
         warn=(
             "{y} is {difference:+.3g} {unit} while {x} falls, against the same {x} while it rises ({share:.1%} of the range, "
             "{p:p}): hysteresis. The slope is {rising:.5g} on the way up and {falling:.5g} on the way down; {name} is that of "
-            "both. Use the part that the runs use, by data_from_line and data_to_line."
+            "both. If the motion uses one way alone, keep its rows: data_from_line and data_to_line in the entry of this table."
         ),
     ),
     "lines.two_rows": Message(

@@ -93,7 +93,7 @@ def plain_symbol(name: str) -> str:
     """The name for a figure, in Unicode and without markup: ``k₂ soft``, ``μ``, ``vₛ``, ``tilt_sd``."""
     base, index, label = symbol_parts(name)
     small = index.translate(str.maketrans("0123456789s", "₀₁₂₃₄₅₆₇₈₉ₛ"))
-    if index and small.isascii():
+    if any(mark.isascii() for mark in small):  # x_start
         small = f"_{index}"
     short = label if len(label) <= _LONGEST_LABEL else label[: _LONGEST_LABEL - 1] + "…"
     return f"{base}{small} {short}".rstrip()
@@ -289,7 +289,13 @@ COLUMNS = (
     OutputColumn("lower", outputs=frozenset({"csv"})),
     OutputColumn("upper", outputs=frozenset({"csv"})),
     OutputColumn("ci95_unwidened", value=lambda values: _ends(values, "_unwidened"), outputs=frozenset({"json"})),
-    OutputColumn("ess", "ESS", lambda row: fixed(float(row.values["ess"]), 0), outputs=EVERYWHERE - {"console"}, sampled=True),
+    OutputColumn(
+        "ess",
+        "ESS",
+        lambda row: fixed(float(min(row.values["ess_bulk"], row.values["ess_tail"])), 0),
+        outputs=EVERYWHERE - {"console"},
+        sampled=True,
+    ),
     OutputColumn("ess_bulk", outputs=FILES),
     OutputColumn("ess_tail", outputs=FILES),
     OutputColumn("rhat", "R-hat", lambda row: fixed(float(row.values["rhat"]), 3), sampled=True),

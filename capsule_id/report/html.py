@@ -36,7 +36,16 @@ from capsule_id.report.columns import (
 )
 from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import figure_of, new_axes, new_figure, png, svg
-from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, question_of, title_of
+from capsule_id.report.messages import (
+    OF_A_SAMPLE,
+    TERMS,
+    TRUST,
+    caption_of,
+    finding_text,
+    messages_of,
+    question_of,
+    title_of,
+)
 from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, after_number, counted
 
 # gallery: All pictures of a result, drawn once: the page embeds the same bytes as in ``figures/``.
@@ -313,6 +322,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
         verdict=verdict_text(result.trust, [(one.finding.level, one.title) for one in shown]),
         best=np.nanmax(result.point_fit.log_posterior),
         notes=[_note(note, messages) for note in result.notes],
+        trust=TRUST,
         terms={term: TERMS[term] for term in TERMS if result.posterior or term not in OF_A_SAMPLE},
         missing=MISSING,
         names=NAMES,
@@ -363,7 +373,8 @@ def sections_of(result: Result, measured: Sequence[Picture], shown: Sequence[Sho
 def leading_section(result: Result, sections: Sequence[Section]) -> tuple[Section | None, str]:
     """The section whose picture convinces or warns, and why; None without a picture.
 
-    It is that of the worst failed check, else of the experiment that informs most of the parameters. A fault that is no
+    It is that of the worst failed check, else of a warning that leaves a parameter unjudged, else of the experiment that
+    informs most of the parameters. A fault that is no
     matter of chance has no probability; it is worse than one that has.
     """
     drawn = [section for section in sections if section.picture]
@@ -373,6 +384,9 @@ def leading_section(result: Result, sections: Sequence[Section]) -> tuple[Sectio
         faults = [(one.finding.facts.get("p", -1.0), i, one) for i, part in enumerate(failed) for one in part.shown[:1]]
         _, i, worst = min(faults, key=lambda fault: fault[:2])
         return failed[i], f"The worst failed check: {worst.title}."
+    if warned := [(section, one) for section in drawn for one in section.shown if one.finding.parameters]:
+        section, one = warned[0]
+        return section, f"Not judged: {', '.join(one.finding.parameters)} ({one.title})."
     whole = (one for section in sections if not section.label for one in section.shown)
     doubted = [one for one in whole if one.finding.level == "fail"]
     names = [name for one in doubted for name in one.finding.parameters] or [str(name) for name in result.summary.index]
@@ -381,7 +395,7 @@ def leading_section(result: Result, sections: Sequence[Section]) -> tuple[Sectio
     best = drawn[int(np.argmax(informs))]
     if doubted:
         return best, f"Failed: {doubted[0].title}. This experiment informs the parameters concerned most."
-    return best, "No check failed. This experiment informs most of the parameters."
+    return best, "No check failed. The readings of this experiment decide more than those of any other."
 
 
 def summary_html(result: Result, verdict: str, changes: Sequence[str]) -> str:
@@ -484,8 +498,9 @@ def _inputs(result: Result) -> Iterator[tuple[str, str]]:
         verb = "Weigh" if stated in ("m1", "m2") else "Measure"
         yield (
             f"{verb} {stated} more precisely",
-            f"The sd of {', '.join(factors)} comes mainly from the stated sd of {stated}. With an exact {stated} it would be "
-            f"at least {', '.join(factors.values())} times smaller; more readings of the tests help little.",
+            f"The sd of {', '.join(factors)} comes mainly from the stated sd of {stated}. With an exact {stated} that of "
+            f"{', that of '.join(f'{name} would be at least {factor} times' for name, factor in factors.items())} smaller; "
+            "more readings of the tests help little.",
         )
 
 

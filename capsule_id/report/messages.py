@@ -11,7 +11,18 @@ from capsule_id.views import Facts, Finding, Level, Message, ResultTable, after_
 # terms: The statistical terms of the report, each in one sentence.
 
 
+#: Meaning of each word of trust.
+TRUST: Mapping[str, str] = {
+    "trusted": "No check found a fault that concerns this parameter: quote it.",
+    "not judged": "A check warns that this number may be wrong, or could not be made: do not quote it before that is settled.",
+    "not trusted": "A check that concerns this parameter failed: do not quote it.",
+}
 TERMS: Mapping[str, str] = {
+    **TRUST,
+    "bench tests, runs": "Bench tests: all experiments without a drive, such as decays, tilts and pushes. Runs are driven.",
+    "x_rel": "Displacement of the rod relative to the capsule.",
+    "P-1-F-2": "A motion that repeats after 1 period of the drive, moves forward (B: backward), and has 2 contacts a period.",
+    "[rig], [model], [prior]": "Tables of the file rig.toml. Lines in quotation of the advice are lines of that file.",
     "posterior": "Distribution of the parameters that follows from the readings and the priors.",
     "sd": "Standard deviation. About 68 % of a normal distribution lies within ± 1 sd, and 95 % within ± 2 sd.",
     "95 % interval": "Range that holds the parameter with probability 0.95, with 0.025 on either side.",
@@ -27,7 +38,8 @@ TERMS: Mapping[str, str] = {
     "chi-square": "Sum of the squared residuals; for a good fit about the number of readings less that of parameters.",
     "autocorrelation time": "Number of steps of the sampler after which a draw no longer depends on an earlier one.",
     "Pareto shape": "How much one reading changes the sample. Above the limit the sample cannot predict that reading.",
-    "ESS": "Effective sample size: number of independent draws that are as informative as the sample.",
+    "ESS": "Effective sample size: number of independent draws as informative as the sample; the smaller one of its middle and "
+    "its tails.",
 }
 #: Terms that appear only where there is a sample.
 OF_A_SAMPLE = frozenset({"95 % interval", "R-hat", "ESS", "autocorrelation time", "Pareto shape"})
@@ -391,7 +403,7 @@ QUESTIONS: Mapping[str, str] = {
     "sample.modes": "Does the sample have one mode?",
     "parameters.informed": "Do the data narrow the prior of every parameter?",
     "priors.conflict": "Do priors and data agree? {z:+.1f} sd apart ({p:p}), limit p = 0.002 over all priors.",
-    "priors.tails": "Does a parameter end in the tail of its prior? The limit is 2.5 sd.",
+    "priors.tails": "Does a parameter end in the tail of its prior? {furthest}: {pull:.2g} sd from its middle, limit 2.5.",
     "residuals.white": "Are the residuals of each record white? {p:p}, limit 0.002 over all records.",
     "trials.order": (
         "Are neighbouring trials independent? Correlation {correlation:.2f} ({p:p}), limits 0.2 and p = 0.005 over all tables."
@@ -566,7 +578,11 @@ def _loads_differ(facts: Facts) -> str:
 def _unseen(facts: Facts) -> str:
     """The smallest error that a check of a setting sees in 8 of 10 cases, by parameter."""
     errors = ", ".join(f"{name} by {sd:.3g} sd" for name, sd in facts["unseen"].items() if sd < float("inf"))
-    return f"the check sees it in 8 of 10 cases where it shifts {errors}" if errors else "too few rows to see it"
+    return (
+        f"one that shifts {errors} is seen in 8 of 10 cases, a smaller one can stay unseen"
+        if errors
+        else "too few rows"
+    )
 
 
 #: What a statistic of the residuals that is too large means.
@@ -649,8 +665,9 @@ FIT_MESSAGES: Mapping[str, Message] = {
         ok="residuals of neighbouring rows are uncorrelated in {number:# table}",
         fail=(
             "expected independent residuals; those of neighbouring rows have correlation {correlation:.2f} over {rows} rows "
-            "({p:p}). The trials drift or come in sessions: an sd of independent trials is too small by a factor "
-            "of about {factor:.1f}. Repeat the trials in random order, with the test set up anew between them."
+            "({p:p}). The trials drift or come in sessions, or loading and unloading differ: an sd of independent trials is "
+            "too small by a factor of about {factor:.1f}. Repeat the trials in random order, with the test set up anew "
+            "between them."
         ),
     ),
     "trials.tables": Message(
@@ -660,20 +677,20 @@ FIT_MESSAGES: Mapping[str, Message] = {
     ),
     "trials.loads": Message(
         "friction against load",
-        ok=lambda facts: f"no constant force beside the friction; {_unseen(facts)}",
+        ok=lambda facts: f"no constant force beside the friction is seen; {_unseen(facts)}",
         warn=lambda facts: (
             f"{counted(facts['rows'], 'row')} cannot show whether friction is in proportion to the normal force: a constant "
-            f"force beside it may be there, and {_unseen(facts)}. Repeat the trials, at loads further apart, or fit the rows "
+            f"force beside it may be there ({_unseen(facts)}). Repeat the trials, at loads further apart, or fit the rows "
             "of one load in a folder of their own."
         ),
         fail=_loads_differ,
     ),
     "trials.speeds": Message(
-        "friction against speed",
-        ok=lambda facts: f"no other fall of the friction with the speed; {_unseen(facts)}",
+        "fall of the friction",
+        ok=lambda facts: f"no other fall of the friction with the speed is seen; {_unseen(facts)}",
         warn=lambda facts: (
             f"expected friction that falls with the speed as the law says; another fall, as with a constant force, has "
-            f"{stated_p(facts['p'])} in {counted(facts['rows'], 'row')}, and {_unseen(facts)}. Repeat the trials, at speeds "
+            f"{stated_p(facts['p'])} in {counted(facts['rows'], 'row')} ({_unseen(facts)}). Repeat the trials, at speeds "
             "further apart, or compare the friction laws in the report."
         ),
     ),

@@ -254,11 +254,9 @@ def find_layout(
 
     Parameters
     ----------
-    content : the bytes of the file
-    path : its name
+    content, path : bytes and name of the file
     dimensions : SI units of all columns of all kinds
-    sheet : of a workbook (None: the first one with numbers)
-    block : first and last line of the block of readings of an interrupted text (None: the longest one)
+    sheet : of a workbook (None: the first with numbers); block: first and last line of an interrupted text (None: the longest)
 
     Raises
     ------
@@ -270,8 +268,7 @@ def find_layout(
         raise InputError(f"a file must have a known format ({' '.join(EXPORTS)})", path.name, "export it as CSV", path)
     text = suffix.removesuffix(COMPRESSED) in TEXTS and not suffix.startswith(".lvm")
     beginning = _beginning(TextFile(content, path)) if text else b""
-    blocks: tuple[tuple[int, int], ...] = ()
-    layout = Layout(missing=NO_READING, sheet=sheet)
+    blocks, layout = tuple[tuple[int, int], ...](), Layout(missing=NO_READING, sheet=sheet)
 
     def read(layout: Layout) -> tuple[Export, Readings]:
         """The export, and what ``_readings`` finds in it: a column of readings at least."""

@@ -121,10 +121,10 @@ def test_a_law_that_few_readings_choose_is_in_doubt() -> None:
     assert (found.level, found.parameters, found.facts["other_line"]) == ("warn", ("v_s",), 'free = ["ratio"]')
     text = messages_of(default_registry())[found.code].text("warn", found.facts)
     assert 'write in [rig]: confirmed = ["friction"]' in text
-    assert "Add slides at other speeds. eq. (1), free ratio is" in text
+    assert "To decide, add slides at other speeds. eq. (1), free ratio is" in text
     words = {**found.facts, "tilts": False, "other": None}
     alone = messages_of(default_registry())[found.code].text("warn", words)
-    assert "Add tilts (static_friction). Where you know" in alone
+    assert "To decide, add tilts (static_friction). Where you know" in alone
     assert bench_twin(DOUBTED, 0.8, ModelChoices(free=("ratio",))).level == "ok"
     assert bench_twin(DOUBTED, 0.8, confirmed=("friction",)).level == "ok"
     assert bench_twin(DOUBTED, 0.5).level == "ok"

@@ -236,7 +236,7 @@ def test_page_one_has_the_picture_that_warns_or_convinces(
     shares = {"k1": {"free_vibration_1": 0.3}, "c": {"free_vibration_1": 0.4}, "K": {"motor_current": 0.6}}
     titles, text = first(with_shares(result, **shares))
     assert titles == ["Free vibration free_vibration_1"]
-    assert "No check failed. This experiment informs most of the parameters." in text
+    assert "No check failed. The readings of this experiment decide more than those of any other." in text
     # A failed check of no experiment: the picture of what informs its parameters.
     conflict = Finding("sample.modes", "fail", {"name": "K"}, parameters=("K",))
     titles, text = first(with_shares(replace(result, findings=(conflict,)), **shares))

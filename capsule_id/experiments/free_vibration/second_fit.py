@@ -278,7 +278,7 @@ def second_models(
             findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "thin": thin}, record.label))
     judged = (i for i, record in enumerate(records) if record.label not in no_decay)
     demanded = partial(_demanded, level=LEVEL / len(records))
-    chosen, named = replaced(kept, judged, demanded, lambda e, model: Screening(e, model.thin).fit(model)[0])
+    chosen, named = replaced(kept, judged, demanded, lambda e, model: Screening(e.with_model(model)).fit(model)[0])
     return chosen, findings + named
 
 

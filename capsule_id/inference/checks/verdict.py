@@ -235,7 +235,8 @@ def _boundary(s: SampledFit) -> list[Finding]:
     names = [name for name, pull in judged if pull > PRIOR_PULL]
     out = {name for name in names if not is_stated(name)} - in_doubt(s)
     keys = [row.prior_key for row in s.target.parameters if row.name in out]
-    facts = {"names": ", ".join(names), "keys": ", ".join(filter(None, keys))}
+    furthest, pull = max(judged, key=lambda one: one[1], default=("none", 0.0))
+    facts = {"names": ", ".join(names), "keys": ", ".join(filter(None, keys)), "furthest": furthest, "pull": pull}
     return [Finding("priors.tails", "warn" if names else "ok", facts, parameters=tuple(names))]
 
 

@@ -415,7 +415,7 @@ def force_on_rod(record: RunRecord, ax: Axes) -> None:
         raise ValueError("this view has no force: give view_record a K and a table with current")
     ax.plot(view.time, view.force, color=PURPLE, lw=1.0, label="K times current")
     ax.plot(view.time, record.force, color=BLACK, ls="--", lw=1.2, label="model")
-    set_text(ax, "time, s", "force on the rod, N", f"motion: {view.label}")
+    set_text(ax, "time, s", "force on the rod, N")
     set_legend(ax, "upper right")
 
 
