@@ -264,6 +264,9 @@ def test_hum_is_modelled_and_its_frequency_found(frequency: float) -> None:
     (found,), (finding,) = second_models([humming(frequency)])
     assert found.model == DecayModel(hum=found.model.hum)
     assert found.model.hum == pytest.approx(frequency, abs=0.01)
+    stated, quoted = finding.facts["alternatives"]  # before: the stated model had the hum too, and both rows were equal
+    assert stated["BIC"] > 100.0 > quoted["BIC"] == 0.0
+    assert (stated["residuals white"], quoted["residuals white"]) == ("no", "yes")
     assert f"hum of {frequency:.4g} Hz" in found.model.name
     assert finding.facts["lines"].endswith(f'hum = {{ value = {found.model.hum:.6g}, unit = "Hz" }}')
     noise = dict(zip(found.scatters, [NOISE], strict=True))

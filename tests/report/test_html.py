@@ -21,10 +21,10 @@ from capsule_id.inference.checks.posterior import AGREEMENT_LEVEL, FARTHEST_MAXI
 from capsule_id.inference.checks.settings import ORDER_LEVEL, SMALLEST_CORRELATION
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.records.tones import SIGNIFICANT, VISIBLE
-from capsule_id.report.columns import table_rows, verdict_text
+from capsule_id.report.columns import printed_table, table_rows, verdict_text
 from capsule_id.report.figures.style import figure_of, new_axes, svg
 from capsule_id.report.html import Picture, pictures, render
-from capsule_id.report.messages import QUESTIONS, TERMS, finding_text, messages_of, question_of
+from capsule_id.report.messages import QUESTIONS, TERMS, TRUST, finding_text, messages_of, question_of
 from capsule_id.views import Finding, Message, ResultTable, Text
 from tests.cli_tools import DATA
 from tests.report.conftest import COLOURED, OUTLIER
@@ -237,6 +237,10 @@ def test_page_one_has_the_picture_that_warns_or_convinces(
     titles, text = first(with_shares(result, **shares))
     assert titles == ["Free vibration free_vibration_1"]
     assert "No check failed. The readings of this experiment decide more than those of any other." in text
+    doubt = Finding("friction.variants", "warn", {}, "motor_current", ("K",))
+    titles, text = first(with_shares(replace(result, findings=(doubt,)), **shares))
+    assert titles == ["Current against force"]
+    assert "Not judged: K (friction law)." in text
     # A failed check of no experiment: the picture of what informs its parameters.
     conflict = Finding("sample.modes", "fail", {"name": "K"}, parameters=("K",))
     titles, text = first(with_shares(replace(result, findings=(conflict,)), **shares))
@@ -317,6 +321,8 @@ def test_the_first_screen_has_value_trust_and_next_step(result: Result, unclean:
     assert "Correct experiment free_vibration_2." in first
     assert "Quote trusted numbers only." in first
     clean = Page(page.partition("<nav")[0] + "</body></html>").text
+    assert f"trusted : {TRUST['trusted']}" in clean.replace("trusted:", "trusted :")
+    assert TRUST["not judged"] not in clean
     warned = sum(finding.level == "warn" for finding in result.findings)
     assert f"V{verdict_text('trusted', [('warn', 'a')] * warned)[1:]}." in clean
     assert 'class="untrusted"' not in page
@@ -327,6 +333,11 @@ def test_a_number_that_must_not_be_quoted_is_named_in_the_verdict(unclean: Resul
     summary.loc["c", "trust"] = "not trusted"
     text = Page(render(replace(unclean, summary=summary), ())).text
     assert "Do not quote c; the other numbers stand as marked." in text
+    assert "see the findings. Not to be quoted: c. The sd contains no error of" in methods_of(
+        replace(unclean, summary=summary)
+    )
+    assert "Not to be quoted" not in methods_of(unclean)
+    assert TRUST["not trusted"] in before_contents(render(replace(unclean, summary=summary), ()))
     assert "Do not quote" not in Page(render(unclean, ())).text
 
 
@@ -352,6 +363,14 @@ def methods_of(result: Result) -> str:
     """The methods paragraph of the page, in one line."""
     (text,) = re.findall(r'<pre id="copy-methods" tabindex="0">(.*)</pre>', render(result, ()))
     return html.unescape(text)
+
+
+def test_the_smallest_sample_size_is_that_of_the_check(result: Result) -> None:
+    """Before: the table showed another, larger number than the check that it passed by."""
+    summary = result.summary.assign(ess=9000.0, ess_bulk=4800.0, ess_tail=4700.0)
+    cells = [cell for _, cells in printed_table(summary, "html")[1] for cell in cells]
+    assert cells.count("4700") == len(summary)
+    assert "9000" not in cells
 
 
 def test_terms_of_the_first_screen_are_explained(page: str) -> None:
