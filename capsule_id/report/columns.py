@@ -206,6 +206,10 @@ def skewed_names(frame: pd.DataFrame) -> list[str]:
     return [row.name for row in table_rows(frame) if row.skewed]
 
 
+#: Change of a parameter of bench tests by an error of 1 %, where it is the same in every rig.
+EFFECTS = {("clock", "k1"): " 2 %", ("clock", "c"): " 1 %", ("gain", "K"): " 1 %", ("gain", "k2"): " 1 %"}
+
+
 def errors_left_out(frame: pd.DataFrame) -> list[str]:
     """A sentence about the errors of instruments that no sd of ``frame`` contains; [] where all are stated."""
     missing = {str(name): str(words).split() for name, words in frame["not_in_sd"].items()}
@@ -213,9 +217,15 @@ def errors_left_out(frame: pd.DataFrame) -> list[str]:
     found = [word for word in INSTRUMENT_WORDS if names[word]]
     if not found:
         return []
-    parts = "; ".join(f"{word}: {', '.join(names[word])}" for word in found)
+    effects = {
+        (word, name): f"{name}{EFFECTS.get((word, symbol_of(name)), '')}" for word in found for name in names[word]
+    }
+    parts = "; ".join(f"{word}: {', '.join(effects[word, name] for name in names[word])}" for word in found)
     words = " or ".join(filter(None, [", ".join(found[:-1]), found[-1]]))
-    return [f"the sd contains no error of {words} ({parts}). How to state them: guide, parameters, Instruments"]
+    per_cent = "; in %: change by an error of 1 %" * ("%" in parts)
+    return [
+        f"the sd contains no error of {words} ({parts}{per_cent}). How to state them: guide, parameters, Instruments"
+    ]
 
 
 def _ends(values: Mapping[Hashable, Any], suffix: str = "") -> list[float] | None:

@@ -259,7 +259,8 @@ def decay(time: np.ndarray, seed: int) -> str:
 def test_what_is_not_stated_is_said_beside_the_numbers(tmp_path: Path) -> None:
     folder, _ = bench(tmp_path / "a", 3, named=False)
     result = cid.fit(cid.read_rig(folder), budget=None)
-    sentence = "the sd contains no error of gain or zero (gain: K, k2[soft], mu; zero: mu)"
+    sentence = "the sd contains no error of gain or zero (gain: K 1 %, k2[soft] 1 %, mu; zero: mu; "
+    sentence += "in %: change by an error of 1 %)"
     assert sentence in " ".join(str(result).split())
     assert sentence in result._repr_html_()
     result.write(tmp_path / "out")
@@ -270,7 +271,7 @@ def test_what_is_not_stated_is_said_beside_the_numbers(tmp_path: Path) -> None:
         "m1": [], "m2": [],
     }  # fmt: skip
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert page.count("he sd contains no error of gain or zero") == 2  # beside the numbers, and in the LaTeX table
+    assert page.count("he sd contains no error of gain or zero") == 3  # beside the numbers, and in the texts to copy
     stated, _ = bench(tmp_path / "b", 3, stated=STATED)
     words = cid.fit(cid.read_rig(stated), budget=None).summary["not_in_sd"]
     assert words.to_dict() == {"K": "gain", "k2[soft]": "gain", "mu": "gain", "m1": "", "m2": ""}

@@ -12,6 +12,7 @@ from scipy import stats
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import LEVEL, Experiment, correlated_records, estimate, refit
 from capsule_id.experiments.friction_model import EQUATION_1
+from capsule_id.experiments.point_test import folded
 from capsule_id.experiments.statistics import LAGS, judged, weighted_mean
 from capsule_id.inference.checks.posterior import (
     PRIOR_PULL,
@@ -169,7 +170,10 @@ def run_checks(sampled: SampledFit) -> SampledFit:
         *_boundary(sampled),
         *_declared_findings(sampled, bench=False),
     ]
-    return replace(sampled, findings=tuple(findings))
+    findings = folded(findings)
+    kept = {finding.experiment for finding in findings if finding.code == "outliers"}
+    flagged = {label: rows for label, rows in flagged.items() if label in kept}
+    return replace(sampled, findings=tuple(findings), flagged=flagged)
 
 
 def _declared_findings(sampled: SampledFit, bench: bool) -> Iterator[Finding]:
