@@ -89,7 +89,7 @@ def test_the_first_page_leads_to_the_guide_and_the_notebooks_show_figures(site: 
 
 def test_the_gallery_shows_a_figure_of_every_chapter_and_its_title(site: Path) -> None:
     page = (site / "capsule_id" / "guide" / "gallery.html").read_text(encoding="utf-8")
-    shown = re.findall(r'<a [^>]*href="[./]*notebooks/(\w+)\.html"[^>]*>\s*<img', page)
+    shown = re.findall(r'<a [^>]*href="[./]*notebooks/(\w+)\.html"[^>]*>(?:<span[^>]*>)?<img', page)
     assert shown == [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
     source = (ROOT / "capsule_id" / "guide" / "gallery.md").read_text(encoding="utf-8")
     for name in shown:

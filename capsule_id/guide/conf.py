@@ -50,8 +50,11 @@ def show_figures(app: Any, page: str, source: list[str]) -> None:
     """Show the figures of notebooks on the page ``gallery``, where its source has links ``[Figure 3](a notebook)``."""
 
     def shown(link: re.Match[str]) -> str:
-        notebook = json.loads((Path(app.srcdir, page).parent / link[2]).read_text(encoding="utf-8"))
-        kept = [out.get("data", {}) for cell in notebook["cells"] for out in cell.get("outputs", [])]
+        file = Path(app.srcdir, page).parent / link[2]
+        if not file.is_file():
+            return link[0]  # Sphinx reports it
+        cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
+        kept = [out.get("data", {}) for cell in cells for out in cell.get("outputs", [])]
         pictures = [data["image/png"] for data in kept if "image/png" in data]
         return f"[![Figure {link[1]}](data:image/png;base64,{pictures[int(link[1]) - 1].strip()})]({link[2]})"
 
