@@ -127,7 +127,7 @@ def execute(notebook: NotebookNode, folder: Path, kernel: AsyncKernelManager, qu
     quickly : XLA does not optimise the programs
     """
     for part in ("notebooks", "data"):
-        shutil.copytree(ROOT / part, folder / part)
+        shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("results"))  # computed anew
     for cell in code(notebook):
         cell.outputs, cell.execution_count = [], None
     own = [CLEAN.format(folder=str(folder / "notebooks")), OPTIMISED.format(quickly=quickly)]

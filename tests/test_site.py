@@ -1,5 +1,7 @@
 """The documentation as a site: it is built without a warning, each public name has its page, each link leads somewhere."""
 
+import json
+import re
 import shutil
 import subprocess
 import sys
@@ -83,6 +85,16 @@ def test_the_first_page_leads_to_the_guide_and_the_notebooks_show_figures(site: 
     chapters = list(site.glob("notebooks/*.html"))
     assert len(chapters) == 10
     assert all("<img" in chapter.read_text(encoding="utf-8") for chapter in chapters)
+
+
+def test_the_gallery_shows_a_figure_of_every_chapter_and_its_title(site: Path) -> None:
+    page = (site / "capsule_id" / "guide" / "gallery.html").read_text(encoding="utf-8")
+    shown = re.findall(r'<a [^>]*href="[./]*notebooks/(\w+)\.html"[^>]*>(?:<span[^>]*>)?<img', page)
+    assert shown == [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
+    source = (ROOT / "capsule_id" / "guide" / "gallery.md").read_text(encoding="utf-8")
+    for name in shown:
+        cells = json.loads((ROOT / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+        assert f"\n#{cells[0]['source'][0]}" in source
 
 
 def test_a_link_that_leads_nowhere_ends_the_build(tmp_path: Path) -> None:

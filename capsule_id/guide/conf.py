@@ -1,5 +1,6 @@
 """The documentation as a site: ``python -m sphinx -W -c capsule_id/guide . site/html`` at the top of a clone."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,24 @@ def lead_to_the_first_page(app: Any, exception: Exception | None) -> None:
     (Path(app.outdir) / "index.html").write_text(page, encoding="utf-8", newline="\n")
 
 
+def show_figures(app: Any, page: str, source: list[str]) -> None:
+    """Show the figures of notebooks on the page ``gallery``, where its source has links ``[Figure 3](a notebook)``."""
+
+    def shown(link: re.Match[str]) -> str:
+        file = Path(app.srcdir, page).parent / link[2]
+        if not file.is_file():
+            return link[0]  # Sphinx reports it
+        cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
+        kept = [out.get("data", {}) for cell in cells for out in cell.get("outputs", [])]
+        pictures = [data["image/png"] for data in kept if "image/png" in data]
+        return f"[![Figure {link[1]}](data:image/png;base64,{pictures[int(link[1]) - 1].strip()})]({link[2]})"
+
+    if page.endswith("/gallery"):
+        source[0] = re.sub(r"\[Figure (\d+)\]\((\S+\.ipynb)\)", shown, source[0])
+
+
 def setup(app: Any) -> None:
-    """Connect the two functions above; Sphinx calls this."""
+    """Connect the three functions above; Sphinx calls this."""
+    app.connect("source-read", show_figures)
     app.connect("autodoc-process-docstring", list_names, priority=400)  # before numpydoc
     app.connect("build-finished", lead_to_the_first_page)

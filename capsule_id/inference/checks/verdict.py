@@ -92,10 +92,11 @@ def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:
 def check_whiteness(s: SampledFit) -> list[Finding]:
     """Check that the residuals of every record are white (Ljung–Box)."""
     correlated, records = correlated_records(s.experiments, s.values)
-    findings = [
-        Finding("residuals.white", "fail", {**one._asdict(), **one.experiment.noise_facts()}, one.experiment.label)
-        for one in correlated
-    ]
+    findings = []
+    for one in correlated:
+        # Not the experiment itself, which holds classes: the finding of a saved result could not be read back.
+        facts = {name: fact for name, fact in one._asdict().items() if name != "experiment"}
+        findings.append(Finding("residuals.white", "fail", facts | one.experiment.noise_facts(), one.experiment.label))
     return findings or [Finding("residuals.white", "ok", {"records": records, "lags": LAGS})] * bool(records)
 
 

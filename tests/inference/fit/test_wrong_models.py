@@ -68,3 +68,4 @@ def test_another_model_is_reported(departure: dict[str, float]) -> None:
     found = whiteness_of(**departure)
     assert (found.level, found.experiment) == ("fail", "run_1")
     assert "not to be trusted" in finding_text(found, FIT_MESSAGES)
+    assert "experiment" not in found.facts  # a written result with it could not be loaded
