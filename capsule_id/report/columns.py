@@ -206,8 +206,8 @@ def skewed_names(frame: pd.DataFrame) -> list[str]:
     return [row.name for row in table_rows(frame) if row.skewed]
 
 
-#: Change of a parameter of bench tests by an error of 1 %, where it is the same in every rig.
-EFFECTS = {("clock", "k1"): " 2 %", ("clock", "c"): " 1 %", ("gain", "K"): " 1 %", ("gain", "k2"): " 1 %"}
+#: Change of a parameter of bench tests by an error of 1 %, in per cent, where it is the same in every rig.
+EFFECTS = {("clock", "k1"): 2, ("clock", "c"): 1, ("gain", "K"): 1, ("gain", "k2"): 1}
 
 
 def errors_left_out(frame: pd.DataFrame) -> list[str]:
@@ -217,14 +217,13 @@ def errors_left_out(frame: pd.DataFrame) -> list[str]:
     found = [word for word in INSTRUMENT_WORDS if names[word]]
     if not found:
         return []
-    effects = {
-        (word, name): f"{name}{EFFECTS.get((word, symbol_of(name)), '')}" for word in found for name in names[word]
-    }
-    parts = "; ".join(f"{word}: {', '.join(effects[word, name] for name in names[word])}" for word in found)
+    parts = "; ".join(f"{word}: {', '.join(names[word])}" for word in found)
     words = " or ".join(filter(None, [", ".join(found[:-1]), found[-1]]))
-    per_cent = "; in %: change by an error of 1 %" * ("%" in parts)
+    plain = ((word, [(name, EFFECTS.get((word, symbol_of(name)))) for name in names[word]]) for word in found)
+    changes = [(word, " and ".join(f"{name} by {size} %" for name, size in own if size)) for word, own in plain]
+    effects = "".join(f". An error of 1 % in the {word} changes {change}" for word, change in changes if change)
     return [
-        f"the sd contains no error of {words} ({parts}{per_cent}). How to state them: guide, parameters, Instruments"
+        f"the sd contains no error of {words} ({parts}){effects}. How to state them: guide, parameters, Instruments"
     ]
 
 

@@ -259,9 +259,9 @@ def decay(time: np.ndarray, seed: int) -> str:
 def test_what_is_not_stated_is_said_beside_the_numbers(tmp_path: Path) -> None:
     folder, _ = bench(tmp_path / "a", 3, named=False)
     result = cid.fit(cid.read_rig(folder), budget=None)
-    sentence = "the sd contains no error of gain or zero (gain: K 1 %, k2[soft] 1 %, mu; zero: mu; "
-    sentence += "in %: change by an error of 1 %)"
-    assert sentence in " ".join(str(result).split())
+    sentence = "the sd contains no error of gain or zero (gain: K, k2[soft], mu; zero: mu)"
+    effect = f"{sentence}. An error of 1 % in the gain changes K by 1 % and k2[soft] by 1 %. How to state"
+    assert effect in " ".join(str(result).split())
     assert sentence in result._repr_html_()
     result.write(tmp_path / "out")
     saved = json.loads((tmp_path / "out" / "parameters.json").read_text(encoding="utf-8"))

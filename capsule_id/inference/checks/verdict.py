@@ -96,7 +96,8 @@ def check_whiteness(s: SampledFit) -> list[Finding]:
     for one in correlated:
         # Not the experiment itself, which holds classes: the finding of a saved result could not be read back.
         facts = {name: fact for name, fact in one._asdict().items() if name != "experiment"}
-        findings.append(Finding("residuals.white", "fail", facts | one.experiment.noise_facts(), one.experiment.label))
+        facts |= one.experiment.noise_facts()
+        findings.append(Finding("residuals.white", "fail", facts, one.experiment.label))
     return findings or [Finding("residuals.white", "ok", {"records": records, "lags": LAGS})] * bool(records)
 
 
