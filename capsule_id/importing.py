@@ -19,6 +19,7 @@ from capsule_id.rig.formats.binary import sheets_of
 from capsule_id.rig.formats.layouts import delimiter_of
 from capsule_id.rig.formats.raw import NO_READING, TextFile
 from capsule_id.rig.guess import (
+    HANGS,
     TIME,
     Assignment,
     ColumnGuess,
@@ -134,6 +135,8 @@ def _doubt(
         unnamed = not text and len(chosen.columns) == 1 and not label.all()
         if unnamed or (unit_of(text, others) not in (None, "%") and unit_of(text, ["kg"]) is None):
             return "unsure", f"column {index + 1}, {found.names[index]!r}, is not used"
+    if any(column.reason.endswith(HANGS) for column in chosen.columns.values()):
+        return "unsure", "a mass is read as a force"
     return "sure", "the columns fit no other kind as well"
 
 
@@ -333,18 +336,21 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
     parts: list[tuple[str | None, tuple[int, int] | None]] = [
         (sheet, None) for sheet in sheets_of(content, path) or (None,)
     ]
+    blocks: tuple[tuple[int, int], ...] = ()
     for sheet, block in parts:  # it grows by the further blocks of a text
         try:
             found = find_layout(content, path, dimensions_of(kinds), sheet, block)
         except InputError as error:
             faults.append(error)
-            entries.append(f"#: Sheet {sheet!r} is not read: {error.rule}, {' '.join(error.value.split())}.\n")
+            what = f"Sheet {sheet!r} is" if block is None else f"Lines {block[0]} to {block[1]} are"
+            entries.append(f"#: {what} not read: {error.rule}, {' '.join(error.value.split())}.\n")
         else:
+            blocks = found.blocks or blocks
+            found = replace(found, blocks=blocks)
             guesses.append(guess(found, kinds))
             entries.append(_entry(found, guesses[-1], content, kinds))
-            used = (found.layout.data_from_line, found.layout.data_to_line)
-            long = [one for one in found.blocks if one[1] - one[0] > FEWEST_SAMPLES and one != used]
-            parts += [(sheet, one) for one in long if block is None]
+            long = [one for one in found.blocks if one[1] - one[0] > FEWEST_SAMPLES]
+            parts += [(sheet, one) for one in long if block is None and one[0] != found.layout.data_from_line]
     if not guesses:
         error = faults[0]
         by_hand = f"{error.remedy}, in the entry that you write: capsule-id init DIR makes a rig.toml with examples"
@@ -436,16 +442,23 @@ def _layout_lines(found: FoundLayout) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
     used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
     part = used.sheet or (used.data_from_line if len(found.blocks) > 1 else None)
-    label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{found.export.path.stem}_{part}") if part else None
+    stem = found.export.path.stem if used.sheet else found.export.path.name
+    label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{stem}_{part}") if part else None
     codes = [text for text in used.missing if text not in NO_READING]
-    one = f"the end of one of {len(found.blocks)} blocks of readings, lines {blocks}"
+    several, one = len(found.blocks) > 1, f"the end of one of {len(found.blocks)} blocks of readings, lines {blocks}"
+    first = "the first row of a block: check that the headers are those of its columns"
     for key, value, confidence, reason in (
-        ("data_from_line", used.data_from_line, "sure", "the first row of readings"),
+        (
+            "data_from_line",
+            used.data_from_line,
+            "unsure" if several else "sure",
+            first if several else "the first row of readings",
+        ),
         (
             "data_to_line",
             used.data_to_line,
             "likely",
-            f"{one}; short ones are not read" if len(found.blocks) > 1 else "the last row of readings",
+            f"{one}; short ones are not read" if several else "the last row of readings",
         ),
         ("missing", codes or None, "likely", "far from all other numbers of their column: codes for no reading"),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),

@@ -251,7 +251,10 @@ def _doubt(variants: Sequence[Variant], used: Variant, fastest: float) -> tuple[
         "slow": fastest < FAST * means["v_s"],
         "shift": max(shifts.values()),
         "means": ", ".join(f"{row.name} = {means[row.symbol]:.3g}{after_number(row.unit)}" for row in moved),
-        "now": ", ".join(f"{row.name} = {used.values[row.symbol]:.3g} ± {used.sds[row.symbol]:.2g}" for row in moved),
+        "now": ", ".join(
+            f"{row.name} = {used.values[row.symbol]:.3g} ± {used.sds[row.symbol]:.2g}{after_number(row.unit)}"
+            for row in moved
+        ),
     }
 
 

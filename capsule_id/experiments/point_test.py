@@ -42,7 +42,7 @@ from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
 from capsule_id.parameters import SAME, STEP_SD, Parameter, parameter
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.rig.schema import Entry
-from capsule_id.views import Comparison, Curve, Finding, Level, Message, Points, ResultTable
+from capsule_id.views import Comparison, Curve, Finding, Message, Points, ResultTable
 
 #: Name of the friction law of the fit in ``PointTest.reads``.
 FRICTION = "friction"
@@ -243,7 +243,6 @@ LINE_MESSAGES = {
         "hysteresis",
         ok="no difference between loading and unloading on {number:# calibration line}",
         warn=_LOOP,
-        fail=_LOOP + ". This explains the failed checks {explains}: no row is to be removed",
     ),
     "lines.two_rows": Message(
         "scatter of calibration lines",
@@ -306,30 +305,6 @@ SMALLEST_DEVIATION = 0.5
 OF_PARABOLA = 3
 #: Fewest rows of loading and of unloading that are compared.
 FEWEST_OF_A_BRANCH = 4
-#: Checks that hysteresis fails, by code.
-EXPLAINED = {"outliers": "outliers", "trials.order": "order of trials", "residuals.statistics": "residuals like noise"}
-
-
-def folded(findings: Sequence[Finding]) -> list[Finding]:
-    """``findings`` in which hysteresis takes the place of the failed checks of the same table that it explains.
-
-    A row or two that stand apart are named beside it.
-    """
-    loops = {one.experiment for one in findings if one.code == "lines.branches" and one.level != "ok"}
-    gone = [
-        one
-        for one in findings
-        if one.experiment in loops
-        and one.code in EXPLAINED
-        and len(one.facts.get("lines", ())) == one.facts.get("most", 0)
-    ]
-    kept = list[Finding]()
-    for one in (one for one in findings if not any(one is other for other in gone)):
-        own = [other for other in gone if other.experiment == one.experiment and one.code == "lines.branches"]
-        explains = ", ".join(EXPLAINED[other.code] for other in own)
-        level: Level = "fail" if any(other.level == "fail" for other in own) else one.level
-        kept.append(replace(one, level=level, facts={**one.facts, "explains": explains}) if own else one)
-    return kept
 
 
 def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:

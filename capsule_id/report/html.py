@@ -384,9 +384,6 @@ def leading_section(result: Result, sections: Sequence[Section]) -> tuple[Sectio
         faults = [(one.finding.facts.get("p", -1.0), i, one) for i, part in enumerate(failed) for one in part.shown[:1]]
         _, i, worst = min(faults, key=lambda fault: fault[:2])
         return failed[i], f"The worst failed check: {worst.title}."
-    if warned := [(section, one) for section in drawn for one in section.shown if one.finding.parameters]:
-        section, one = warned[0]
-        return section, f"Not judged: {', '.join(one.finding.parameters)} ({one.title})."
     whole = (one for section in sections if not section.label for one in section.shown)
     doubted = [one for one in whole if one.finding.level == "fail"]
     names = [name for one in doubted for name in one.finding.parameters] or [str(name) for name in result.summary.index]
@@ -395,6 +392,9 @@ def leading_section(result: Result, sections: Sequence[Section]) -> tuple[Sectio
     best = drawn[int(np.argmax(informs))]
     if doubted:
         return best, f"Failed: {doubted[0].title}. This experiment informs the parameters concerned most."
+    if warned := [(section, one) for section in drawn for one in section.shown if one.finding.parameters]:
+        section, one = warned[0]
+        return section, f"A warning concerns {', '.join(one.finding.parameters)}: {one.title}."
     return best, "No check failed. The readings of this experiment decide more than those of any other."
 
 

@@ -92,10 +92,14 @@ WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, wor
 }.items()}  # fmt: skip
 #: Columns of texts that tell the rows of a friction table apart.
 LABELS = ("surface", "direction")
+#: What makes a mass a force.
+HANGS = "the weight, if this mass hangs there"
 #: Names of the same quantity.
 SAME = {"acceleration_rod": "acceleration", "slope": "angle", "speed": "velocity"}
 #: Fewest letters of a word that can end a compound, and shorter words that can.
 SHORTEST_HEAD, SHORT_HEADS = 5, ("weg", "zeit")
+#: How well a name with a number fits, such as x1: it is one of several.
+NUMBERED = 1.5
 #: Units of headers that state none: names that programs give to their columns, and a normal force, or one in N.
 UNITS_OF_NAMES: Mapping[str, str | None] = {"X_Value": "s", "F_N": None}
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*")
@@ -146,7 +150,7 @@ def _bare(name: str) -> str:
 
 
 def fits_name(name: str, column: str) -> float:
-    """3 for the name of the column itself, 2.5 for words of it alone, 2 with others, 1 for a compound that ends with one.
+    """3 for the name of the column itself, 2.5 for words of it alone, 2 with others, less for x1 and for compounds.
 
     0 for another name, -1 for an uncertainty. ``Federkraft`` ends with ``kraft``.
     """
@@ -157,9 +161,10 @@ def fits_name(name: str, column: str) -> float:
     if bare == column.lower():
         return 3
     known = WORDS.get(SAME.get(column, column), ())
-    words = [word if word in known else word.rstrip("0123456789") or word for word in words]  # x1 is one x of several
     if any(word in (*words, *map("".join, pairwise(words))) for word in known):  # F_N is FN
         return 2.5 if set(words) <= set(known) or "".join(words) in known else 2
+    if any(word.rstrip("0123456789") in known for word in words):
+        return NUMBERED
     heads = (word for word in known if len(word) >= SHORTEST_HEAD or word in SHORT_HEADS)
     return float(any(word.endswith(tuple(heads)) for word in words))
 
@@ -268,7 +273,7 @@ def find_layout(
         raise InputError(f"a file must have a known format ({' '.join(EXPORTS)})", path.name, "export it as CSV", path)
     text = suffix.removesuffix(COMPRESSED) in TEXTS and not suffix.startswith(".lvm")
     beginning = _beginning(TextFile(content, path)) if text else b""
-    blocks, layout = tuple[tuple[int, int], ...](), Layout(missing=NO_READING, sheet=sheet)
+    blocks, layout = tuple[tuple[int, int], ...](), Layout(*(block or (None, None)), missing=NO_READING, sheet=sheet)
 
     def read(layout: Layout) -> tuple[Export, Readings]:
         """The export, and what ``_readings`` finds in it: a column of readings at least."""
@@ -280,15 +285,15 @@ def find_layout(
         return export, found
 
     try:
-        if text:
+        if text and block is None:
             layout = _text_layout(beginning, path.with_suffix("") if suffix.endswith(COMPRESSED) else path)
         export, (columns, singles, unread) = read(layout)
     except InputError:
-        blocks = _blocks(TextFile(content, path), layout) if text else ()
+        blocks = _blocks(TextFile(content, path), layout) if text and block is None else ()
         if not blocks:
             raise
     if blocks:  # what was read before is free by now
-        first, last = block or max(blocks, key=lambda lines: lines[1] - lines[0])
+        first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
         layout = replace(layout, data_from_line=first, data_to_line=last)
         export, (columns, singles, unread) = read(layout)
     if (other := no_readings(export, layout, [*columns.values()])[1]) != layout:
@@ -741,7 +746,7 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
         return None
     mass = unit_of(text, ["kg"]) if name == "force" and "normal_force" not in kind.columns else None
     if mass in ("kg", "g", "lb") and (named or fits_name(stem, "mass") > 0):
-        return named or 1.0, ColumnGuess(index, f"{mass}f", "unsure", f"{said}: the weight, if this mass hangs there")
+        return named or 1.0, ColumnGuess(index, f"{mass}f", "unsure", f"{said}: {HANGS}")
     if text and unit is None:
         return None
     below = unit_of(found.units[index], [rule.si])
@@ -759,7 +764,9 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     if unit is None:
         return by_name, ColumnGuess(index, UNKNOWN, "unsure", missing)
     reason = said if unit == text else f"{said}, read as {unit}"
-    return by_name + UNIT_SCORE, ColumnGuess(index, unit, "likely" if unit == "g_n" else "sure", reason)
+    return by_name + UNIT_SCORE, ColumnGuess(
+        index, unit, "likely" if unit == "g_n" or named == NUMBERED else "sure", reason
+    )
 
 
 def lines_of_labels(found: FoundLayout, kind: KindRule) -> Iterable[tuple[str, str]]:

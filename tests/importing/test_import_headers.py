@@ -264,7 +264,7 @@ def test_numbered_names_are_names(tmp_path: Path) -> None:
     )
     (tmp_path / "d.csv").write_text(f"t1 (s),x1 (mm),t2 (s),x2 (mm)\n{rows}", encoding="utf-8")
     entry = capsule_id.propose_entry(tmp_path / "d.csv")
-    assert '\ncolumns.time = { from = "t1 (s)", unit = "s" }  # sure' in entry
+    assert '\ncolumns.time = { from = "t1 (s)", unit = "s" }  # likely' in entry
     for name in ("x1 (mm)", "x2 (mm)"):
         assert f'\n# columns.x_rel = {{ from = "{name}", unit = "mm" }}' in entry
 

@@ -240,7 +240,7 @@ def test_page_one_has_the_picture_that_warns_or_convinces(
     doubt = Finding("friction.variants", "warn", {}, "motor_current", ("K",))
     titles, text = first(with_shares(replace(result, findings=(doubt,)), **shares))
     assert titles == ["Current against force"]
-    assert "Not judged: K (friction law)." in text
+    assert "A warning concerns K: friction law." in text
     # A failed check of no experiment: the picture of what informs its parameters.
     conflict = Finding("sample.modes", "fail", {"name": "K"}, parameters=("K",))
     titles, text = first(with_shares(replace(result, findings=(conflict,)), **shares))

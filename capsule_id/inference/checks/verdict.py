@@ -12,7 +12,6 @@ from scipy import stats
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import LEVEL, Experiment, correlated_records, estimate, refit
 from capsule_id.experiments.friction_model import EQUATION_1
-from capsule_id.experiments.point_test import folded
 from capsule_id.experiments.statistics import LAGS, judged, weighted_mean
 from capsule_id.inference.checks.posterior import (
     PRIOR_PULL,
@@ -172,10 +171,7 @@ def run_checks(sampled: SampledFit) -> SampledFit:
         *_boundary(sampled),
         *_declared_findings(sampled, bench=False),
     ]
-    findings = folded(findings)
-    kept = {finding.experiment for finding in findings if finding.code == "outliers"}
-    flagged = {label: rows for label, rows in flagged.items() if label in kept}
-    return replace(sampled, findings=tuple(findings), flagged=flagged)
+    return replace(sampled, findings=tuple(findings))
 
 
 def _declared_findings(sampled: SampledFit, bench: bool) -> Iterator[Finding]:

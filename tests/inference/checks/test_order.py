@@ -8,7 +8,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.experiments.point_test import folded, lack_of_fit
+from capsule_id.experiments.point_test import lack_of_fit
 from capsule_id.experiments.statistics import ORDERED, permutation_p
 from capsule_id.inference.checks.settings import (
     ORDER_LEVEL,
@@ -19,7 +19,6 @@ from capsule_id.inference.checks.settings import (
     heterogeneity,
     lag_1,
 )
-from capsule_id.views import Finding
 from tests.measured.folders import Entry, make_rig, quantity
 
 
@@ -249,25 +248,9 @@ def test_too_few_rows_see_no_error() -> None:
     assert (p, unseen[0]) == (1.0, np.inf)
 
 
-def test_hysteresis_explains_many_rows_that_stand_apart_but_no_slip_of_the_pen() -> None:
-    """Before: "remove" three good rows. Another table keeps its findings."""
-    loop, many = Finding("lines.branches", "warn", {}, "a", ("K",)), {"lines": [2, 3, 4], "most": 3}
-    order = Finding("trials.order", "fail", {}, "a")
-    (found,) = folded([Finding("outliers", "fail", many, "a"), order, loop])
-    assert (found.code, found.level, found.parameters) == ("lines.branches", "fail", ("K",))
-    assert found.facts["explains"] == "outliers, order of trials"
-    one = Finding("outliers", "fail", {"lines": [2], "most": 3}, "a")
-    assert folded([one, loop]) == [one, loop]
-    elsewhere = [Finding("outliers", "fail", many, "b"), Finding("lines.branches", "ok", {"number": 2})]
-    assert folded([*elsewhere, loop]) == [*elsewhere, loop]
-
-
-@pytest.mark.parametrize(("loop", "level"), [(0.0, "ok"), (0.04, "fail")])
+@pytest.mark.parametrize(("loop", "level"), [(0.0, "ok"), (0.04, "warn")])
 def test_loading_and_unloading_are_compared(tmp_path: Path, loop: float, level: str) -> None:
-    """A spring loaded and unloaded: the finding names both branches, and k2 of both holds the truth within its sd.
-
-    It explains the order of the rows (before: a further failed check with another remedy).
-    """
+    """A spring loaded and unloaded: the finding names both branches, and k2 of both holds the truth within its sd."""
     up, rng = np.linspace(0.1, 2.0, 12), np.random.default_rng(1)
     x = np.concatenate([up, up[::-1][1:]])
     y = 19.0 * x - np.where(np.arange(23) < 12, 0.0, loop * 76.0 * x * (1.0 - x / 2.0)) + 0.05 * rng.standard_normal(23)
@@ -278,10 +261,8 @@ def test_loading_and_unloading_are_compared(tmp_path: Path, loop: float, level: 
     assert found.level == level
     k2 = result["k2[a]"]
     assert abs(k2.value - 19e3) < 3.0 * k2.sd
-    assert not [f for f in result.findings if f.level == "fail" and f.code == "trials.order"]
-    assert found.facts.get("explains", "") == ("order of trials" if level == "fail" else "")
     if loop:
         assert "hysteresis" in result.text(found)
         assert found.facts["rising"] == pytest.approx(19e3, rel=0.01)
-        assert 0.01 < found.facts["share"] < 0.2
+        assert 0.01 < found.facts["share"] < 0.1
         assert k2.trust != "trusted"
