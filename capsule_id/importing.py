@@ -349,7 +349,7 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
             found = replace(found, blocks=blocks)
             guesses.append(guess(found, kinds))
             entries.append(_entry(found, guesses[-1], content, kinds))
-            long = [one for one in found.blocks if one[1] - one[0] > FEWEST_SAMPLES]
+            long = [one for one in found.blocks if one[1] - one[0] >= FEWEST_SAMPLES]
             parts += [(sheet, one) for one in long if block is None and one[0] != found.layout.data_from_line]
     if not guesses:
         error = faults[0]
@@ -458,7 +458,7 @@ def _layout_lines(found: FoundLayout) -> Iterable[str]:
             "data_to_line",
             used.data_to_line,
             "likely",
-            f"{one}; short ones are not read" if several else "the last row of readings",
+            f"{one}; those of {FEWEST_SAMPLES} rows or fewer have no entry" if several else "the last row of readings",
         ),
         ("missing", codes or None, "likely", "far from all other numbers of their column: codes for no reading"),
         ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),

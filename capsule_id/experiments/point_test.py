@@ -204,11 +204,6 @@ def _slopes(test: PointTest, theta: ValuesBySymbol) -> dict[str, jax.Array]:
 # line: Shared declarations of calibration lines: rule on reading errors, the paper's straight line, lint.
 
 
-_LOOP = (
-    "{y} is {difference:+.3g} {unit} while {x} falls, against the same {x} while it rises ({share:.1%} of the range, {p:p}): "
-    "hysteresis. The slope is {rising:.5g} on the way up and {falling:.5g} on the way down; {name} is that of both. If the "
-    "motion uses one way alone, keep its rows: data_from_line and data_to_line in the entry of this table"
-)
 LINE_MESSAGES = {
     "lines.rise": Message(
         "linearity",
@@ -242,7 +237,11 @@ LINE_MESSAGES = {
     "lines.branches": Message(
         "hysteresis",
         ok="no difference between loading and unloading on {number:# calibration line}",
-        warn=_LOOP,
+        warn=(
+            "{y} is {difference:+.3g} {unit} while {x} falls, against the same {x} while it rises ({share:.1%} of the range, "
+            "{p:p}): hysteresis. The slope is {rising:.5g} on the way up and {falling:.5g} on the way down; {name} is that of "
+            "both. If the motion uses one way alone, keep its rows: data_from_line and data_to_line in the entry of this table."
+        ),
     ),
     "lines.two_rows": Message(
         "scatter of calibration lines",

@@ -242,6 +242,22 @@ def test_each_block_of_a_record_that_a_line_interrupts_has_an_entry(tmp_path: Pa
         assert sum(len(table["time"]) for table in rig.tables) == sum(end - first + 1 for first, end in lines)
 
 
+def test_blocks_that_end_with_statistics_or_hold_no_column(tmp_path: Path) -> None:
+    """Before: the block above rows of means had two entries of one label; a block without numbers was "Sheet None"."""
+    means = "mean,0.1\nstd,0.7\n"
+    cells = ("{:.4f},NaN,NaN", "NaN,1.5,NaN", "NaN,NaN,2.5")
+    holes = "".join(f"{cells[k % 3].format(5e-4 * k)}\n" for k in range(80))
+    for rest in ("run 2\n" + swing(range(90)), "Block 2\n" + holes):
+        wide = rest.endswith(holes)
+        first = swing(range(100), "Time (s),Disp (mm),Note (1)\n" if wide else "Time (s),Disp (mm)\n")
+        text = first.replace("\n", ",1\n").replace("(1),1", "(1)") if wide else first + means
+        (tmp_path / "d.csv").write_text(text + rest, encoding="utf-8")
+        entry = capsule_id.propose_entry(tmp_path / "d.csv")
+        labels = re.findall(r'^label = "(.*)"', entry, re.MULTILINE)
+        assert labels == (["d.csv_2"] if wide else ["d.csv_2", "d.csv_106"])
+        assert ("#: Lines 103 to 182 are not read: " in entry) == wide
+
+
 def test_masses_that_hang_from_a_spring_are_offered_as_its_force(tmp_path: Path) -> None:
     """Before: no kind. Control: beside a pull they are no force, and a mass alone is no spring."""
     rows = [f"{100 * k};{1.5 * k:.1f}" for k in range(1, 7)]
