@@ -244,13 +244,14 @@ def test_each_block_of_a_record_that_a_line_interrupts_has_an_entry(tmp_path: Pa
 
 def test_blocks_that_end_with_statistics_or_hold_no_column(tmp_path: Path) -> None:
     """Before: the block above rows of means had two entries of one label; a block without numbers was "Sheet None"."""
-    means = "mean,0.1\nstd,0.7\n"
+    means = "0.0250,0.1,mean\n0.0145,0.7,std\n"
     cells = ("{:.4f},NaN,NaN", "NaN,1.5,NaN", "NaN,NaN,2.5")
     holes = "".join(f"{cells[k % 3].format(5e-4 * k)}\n" for k in range(80))
-    for rest in ("run 2\n" + swing(range(90)), "Block 2\n" + holes):
+    for rest in ("run 2\n" + swing(range(90)).replace("\n", ",\n"), "Block 2\n" + holes):
         wide = rest.endswith(holes)
-        first = swing(range(100), "Time (s),Disp (mm),Note (1)\n" if wide else "Time (s),Disp (mm)\n")
-        text = first.replace("\n", ",1\n").replace("(1),1", "(1)") if wide else first + means
+        head, end = ("Note (1)", ",1\n") if wide else ("remark", ",\n")
+        first = swing(range(100), "").replace("\n", end)
+        text = f"Time (s),Disp (mm),{head}\n{first}" + means * (not wide)
         (tmp_path / "d.csv").write_text(text + rest, encoding="utf-8")
         entry = capsule_id.propose_entry(tmp_path / "d.csv")
         labels = re.findall(r'^label = "(.*)"', entry, re.MULTILINE)
@@ -270,7 +271,9 @@ def test_masses_that_hang_from_a_spring_are_offered_as_its_force(tmp_path: Path)
         (tmp_path / "s.csv").write_text("\n".join([header, *rows, ""]), encoding="utf-8")
         entry = capsule_id.propose_entry(tmp_path / "s.csv")
         assert line in entry
-        assert ('kind = "support_spring"' in entry) == ("f" in line[-20:] and "unsure" in line)
+        assert ('kind = "support_spring"  # unsure: a mass is read as a force' in entry) == (
+            "f" in line[-20:] and "unsure" in line
+        )
 
 
 def test_numbered_names_are_names(tmp_path: Path) -> None:
