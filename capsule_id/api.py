@@ -30,6 +30,7 @@ from capsule_id.inference.pipeline import (
     stage_seeds,
     unfinished,
 )
+from capsule_id.inference.planning import Plan, next_tests
 from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.prediction import DRAWS, predict, random_draws
 from capsule_id.inference.profiles import check_profiled
@@ -290,6 +291,13 @@ class Fit(Result):
         ``result.tune({"P_d": (1.0, 6.0), "Omega": (20.0, 50.0)}, {"G": 1e-3}).table``; bounds and given values in SI.
         """
         return tune(self, bounds, given, **options)
+
+    def next_tests(self, targets: Sequence[str] = (), **options: Any) -> Plan:
+        """Rank further tests by the expected sd of ``targets``; see ``capsule_id.inference.planning.next_tests``.
+
+        ``result.next_tests(["c", "v_s"], minutes=30).table``.
+        """
+        return next_tests(self, targets, **options)
 
     def plot_comparison(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Readings with the predicted curve and its 95 % band; ``label`` as in ``comparisons``, by default the first."""

@@ -69,6 +69,8 @@ def _commands() -> tuple[tuple[str, Any, str, str], ...]:
         fit,
         import_file,
         init,
+        next,
+        plan,
         predict,
         report,
         simulate,
@@ -110,6 +112,13 @@ def _commands() -> tuple[tuple[str, Any, str, str], ...]:
             tune,
             "the settings of drive and rig with the largest mean velocity, from a result",
             "results/twin --P_d 1 6 --Omega 20 50 --G 0.001 --spring soft --out tuned.csv",
+        ),
+        ("plan", plan, "what planned tests would show, from the priors, before they are made", "my-rig"),
+        (
+            "next",
+            next,
+            "further tests, ranked by the uncertainty that they leave, from a result",
+            "results/twin --for c,v_s --minutes 30",
         ),
         (
             "report",

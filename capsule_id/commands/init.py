@@ -21,13 +21,15 @@ from capsule_id.rig.schema import (
     OPTIONAL,
     RIG_QUANTITIES,
     RIG_WORDS,
+    TABLE_KEYS,
     KindRule,
     NameRule,
     QuantityRule,
     number_schema,
     table_schema,
+    words_of_tests,
 )
-from capsule_id.rig.toml import ANY, NAME_PATTERN, PRIOR_KEYS, Node, parse_toml
+from capsule_id.rig.toml import ANY, NAME_PATTERN, POSITIVE, PRIOR_KEYS, Node, parse_toml
 
 #: The head of ``rig.toml``. Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
 HEAD = Path(__file__).with_name("template.toml")
@@ -106,12 +108,14 @@ def rig_schema(kinds: Registry) -> dict[str, Any]:
     springs = {"patternProperties": {rf"^k2\[{NAME_PATTERN}\]$": priors.pop("k2")}}
     error = table_schema({**QuantityRule("1", ANY, has_sd=True).schema["properties"], "unit": _TEXT}, ("unit",))
     instrument = {"name": NameRule(), "gain": error, "offset": error, "clock": error}
+    tests = table_schema(dict.fromkeys(words_of_tests(kinds), number_schema(POSITIVE)))
     tables = {
         "rig": table_schema({**RIG_WORDS, **RIG_QUANTITIES, "confirmed": _TEXTS}, ("name",)),
         "model": table_schema(
             {**MODEL_RULES, "free": {"type": "array", "items": {"enum": OPTIONAL}, "uniqueItems": True}}
         ),
         "prior": table_schema(priors) | springs,
+        "plan": table_schema(dict.fromkeys(TABLE_KEYS["[plan]"], tests)),
         "instrument": {"type": "array", "items": table_schema(instrument, ("name",))},
         "experiment": {"type": "array", "minItems": 1, "items": {"allOf": [every, *chosen]}},
     }

@@ -60,6 +60,13 @@ def write_new_files(written: Sequence[tuple[str, Path, bytes]], about: str = "")
         say(f"wrote {file}{about if option == '--out' else ''}")
 
 
+def say_failed(result: cid.Fit) -> None:
+    """Print the failed checks of a result that is not trusted, and its verdict."""
+    if result.trust != "trusted":
+        failed = [f"fail {found.code}: {result.text(found)}" for found in result.findings if found.level == "fail"]
+        say("\n".join([*failed, result.verdict]), coloured=True)
+
+
 def check_new_files(args: argparse.Namespace) -> None:
     """Refuse ``--out`` and ``--figure`` that are no new files in a directory, and a figure that is no PNG of its own.
 
@@ -77,7 +84,6 @@ def check_new_files(args: argparse.Namespace) -> None:
             raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
         if not room:
             raise InputError(f"{option} must stand in a directory", "there is none", f"make {file.parent}", file)
-    if args.figure is not None and (
-        args.figure.suffix.lower() != ".png" or args.figure.resolve() == args.out.resolve()
-    ):
+    same = args.figure and args.out and args.figure.resolve() == args.out.resolve()
+    if args.figure is not None and (args.figure.suffix.lower() != ".png" or same):
         raise InputError("--figure must name a .png file of its own", args.figure.name, "write NAME.png", args.figure)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET
-from capsule_id.commands.predict import check_new_files, write_new_files
+from capsule_id.commands.predict import check_new_files, say_failed, write_new_files
 from capsule_id.commands.simulate import number, whole_number
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError, check_seed
@@ -65,11 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.report.figures import style, sweeps
 
     result = cid.load(args.result)
-    if result.trust != "trusted":
-        failed = [
-            f"fail {finding.code}: {result.text(finding)}" for finding in result.findings if finding.level == "fail"
-        ]
-        say("\n".join([*failed, result.verdict]), coloured=True)
+    say_failed(result)
     with Progress(not args.quiet, unit="setting") as progress:
         options = {"faster_than": faster_than, "spring": args.spring, "draws": draws, "seed": args.seed}
         found = result.tune(bounds, given, **options, progress=progress)

@@ -130,6 +130,9 @@ KIND = Kind(
     masses_of_free=MASSES_OF_FREE,
     parameters=(PUSH_SCATTER,),
     read_by=INSTRUMENT_ERRORS,
+    test="push",
+    minutes=0.5,
+    set_by="speed",
     make=made_by(
         f"{__name__}:DynamicFriction",
         capsule="capsule_id.experiments.capsule_experiment:CapsulePushes",

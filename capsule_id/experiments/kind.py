@@ -113,6 +113,7 @@ class Kind(KindRule):
     paper : estimates by the paper's protocol, by parameter name. Kinds with the same function are evaluated together
     rough : less biased rough values than the paper's, before a fit, by parameter name
     panels : predictions and readings, with a band from draws. Kinds with the same function share their panels
+    set_by : column whose values a further test may choose beyond the measured ones
     twin : simulates tables from true values, SI by name, with errors from a generator (shared by all bench kinds) or
         from a seed. None: ``synthesize`` omits the kind
     truth : true values, SI by name, that only this kind adds to a synthetic rig
@@ -130,6 +131,7 @@ class Kind(KindRule):
     paper: Callable[[Sequence[Any]], Values] = field(default=lambda experiments: {})
     rough: Callable[[Sequence[Any], Rig], Values] = field(default=lambda experiments, rig: {})
     panels: Callable[[Sequence[Any], Values, Sequence[Values]], Iterable[Comparison]] = own_panels
+    set_by: str = ""
     twin: Callable[[Values, np.random.Generator, int], Twin] | None = None
     truth: Values = field(default_factory=dict)
 

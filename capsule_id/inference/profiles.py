@@ -4,7 +4,7 @@ The profile of a parameter is the log-posterior without its own prior, maximised
 (Raue et al., *Bioinformatics* 25, 2009, 1923). The others keep their priors: a weighing is a reading.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -116,21 +116,30 @@ def identified(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
     narrow = (ratio <= NARROW_RATIO) & (~target.positive | (sd <= NARROW_SD))
     open_ = [name for name, i in zip(names, place, strict=True) if not (narrow[i] or quick)]
     profiles = _profiles(target, fit, open_, SHORT)
-    correlation = fit.covariance / np.outer(sd, sd) - np.eye(len(sd))
-    # By the curvature: the precision of the posterior less that of the prior.
-    bounded, rows = 0.5 * REACH**2 * (1.0 - ratio**2) >= DROP, {}
-    for name, i in zip(names, place, strict=True):
-        low = high = bool(bounded[i])
-        if name in profiles:
-            low, *_, high = profiles[name]["profile"].to_numpy() <= -DROP
+    ends = {name: profiles[name]["profile"].to_numpy() <= -DROP for name in profiles}
+    table = words_of(target.names, fit.covariance, ratio, {name: (bool(x[0]), bool(x[-1])) for name, x in ends.items()})
+    return [ResultTable("parameters.identified", table.loc[names].round(4))]
+
+
+def words_of(
+    names: Sequence[str], covariance: np.ndarray, ratio: np.ndarray, ends: Mapping[str, tuple[bool, bool]] | None = None
+) -> pd.DataFrame:
+    """The rows of ``identified`` by name; ``ratio`` (d,): sd over prior sd; ``ends``: where a profile falls, below and above.
+
+    Without a profile the precision of the posterior less that of the prior decides.
+    """
+    sd, rows = np.sqrt(np.diag(covariance)), {}
+    correlation = covariance / np.outer(sd, sd) - np.eye(len(sd))
+    bounded = 0.5 * REACH**2 * (1.0 - ratio**2) >= DROP
+    for i, name in enumerate(names):
+        low, high = (ends or {}).get(name, (bool(bounded[i]), bool(bounded[i])))
         word = "bounded" if low and high else "upper limit" if high else "lower limit" if low else "flat"
         partner = int(np.argmax(np.abs(correlation[i])))
-        tied = f", tied to {target.names[partner]}" if abs(correlation[i, partner]) >= TIED else ""
+        tied = f", tied to {names[partner]}" if abs(correlation[i, partner]) >= TIED else ""
         rows[name] = {
             "known": word + tied,
             "correlation": correlation[i, partner],
-            "with": target.names[partner],
+            "with": names[partner],
             "sd / prior sd": ratio[i],
         }
-    frame = pd.DataFrame.from_dict(rows, orient="index").round(4).rename_axis("parameter")
-    return [ResultTable("parameters.identified", frame)]
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")

@@ -13,7 +13,7 @@ from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.declaration import RunSettings
 from capsule_id.experiments.progression.declaration import AMPLITUDE, ProgressionSettings, settings_of
-from capsule_id.inference.prediction import random_draws
+from capsule_id.inference.prediction import random_draws, require_equation_1
 from capsule_id.inference.result import Result
 from capsule_id.motions.response import REST, Settling
 from capsule_id.motions.sweep import QUANTILES, MotionColumns, SweepPoints, compute, spread_starts
@@ -204,9 +204,7 @@ def _search(
 
 def _check_search(result: Result, bounds: Values, given: Values, drive: str, faster_than: float | None) -> None:
     """Refuse what cannot be searched."""
-    law = result.provenance.friction
-    if law.split(",")[0] != "eq. (1)":
-        raise InputError("tune computes with eq. (1), and the result must have been fitted with it", law, "fit with it")
+    require_equation_1(result)
     if not bounds:
         raise InputError(
             "a search needs the bounds of a setting", "none", "give two values of P_d, Omega, G or another"

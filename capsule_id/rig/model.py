@@ -187,6 +187,7 @@ class Rig:
     slope, N0 : slope of the track, rad, and pressing force, N, of experiments that state no other (None: not stated)
     confirmed : names of masses, columns and settings whose unusual values are right: ``m1``, ``decay_1.x_rel``; "friction":
         the law of ``model`` holds, so that its values are judged where the readings do not tell it from others
+    plan : "minutes" of one further test and number of "tests", by the word for one test
     """
 
     name: str
@@ -202,6 +203,7 @@ class Rig:
     slope: Quantity | None = None
     N0: Quantity | None = None
     confirmed: tuple[str, ...] = ()
+    plan: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         kinds = Counter(table.kind for table in self.tables)

@@ -49,6 +49,7 @@ from capsule_id.rig.schema import (
     parameter_rows,
     read_confirmed,
     read_model,
+    read_plan,
     read_rules,
 )
 from capsule_id.rig.times import Record, records_of, remedy_of_order
@@ -62,7 +63,9 @@ from capsule_id.views import Finding
 _READING_ERRORS = ("_sd", "_resolution", "_instrument")
 
 
-def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequence[Parameter] = ()) -> Rig:
+def read_rig(
+    folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequence[Parameter] = (), planned: bool = False
+) -> Rig:
     """Read and check a rig folder.
 
     Parameters
@@ -70,6 +73,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     folder : holds ``rig.toml`` and the tables that it names; or the path of ``rig.toml``
     kinds : the kinds of experiments that it may have, by name
     parameters : further rows that ``[prior]`` may state, those of a friction law
+    planned : leave out the experiments, whose files may not be there yet
 
     Returns
     -------
@@ -83,18 +87,21 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         rig.toml, and of every experiment the first one in its files. What depends on faulty parts is not judged.
     """
     root, sha256 = _read_document(Path(folder))
-    root.refuse_unknown(("rig", "model", "prior", "instrument", "experiment"))
+    root.refuse_unknown(("rig", "model", "prior", "instrument", "experiment", "plan"))
     if "rig" not in root:
         raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", root.document.path, 1, 1)
     faults = list[InputError]()
     words, stated = _read_head(root["rig"].table("[rig]"), faults)
     ground = {key: stated[key] for key in ("slope", "N0") if key in stated}
-    tables, files = _read_experiments(root, kinds, ground, faults)
+    tables, files = ((), {}) if planned else _read_experiments(root, kinds, ground, faults)
     rows = (*parameter_rows(kinds).values(), *parameters)
     with collecting(faults):
-        priors = _read_priors(root, tables, rows, faults)
+        priors = _read_priors(root, None if planned else tables, rows, faults)
     with collecting(faults):
         model = read_model(root)
+    plan = dict[str, dict[str, float]]()
+    with collecting(faults):
+        plan = read_plan(root, kinds)
     raise_all(faults)
     check_masses(root, model, tables, kinds, set(stated))
     check_engine(root, model, tables)
@@ -113,6 +120,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         slope=stated.get("slope"),
         N0=stated.get("N0"),
         confirmed=read_confirmed(root, tables, stated),
+        plan=plan,
     )
 
 
@@ -165,17 +173,17 @@ def _read_document(folder: Path) -> tuple[Node, str]:
 
 
 def _read_priors(
-    root: Node, tables: Sequence[Table], parameters: Sequence[Parameter], faults: list[InputError]
+    root: Node, tables: Sequence[Table] | None, parameters: Sequence[Parameter], faults: list[InputError]
 ) -> dict[str, Prior]:
     """The entries of ``[prior]``, by parameter name; they may state the priors of ``parameters``.
 
-    Errors are appended to ``faults``. Where there are some, an experiment may be missing, and its spring with it.
+    Errors are appended to ``faults``. Where there are some, or no ``tables`` are read, a spring may be missing.
     """
     entries = root.get("prior", {}).table("[prior]")
     rows = {row.symbol: row for row in parameters if row.prior_can_be_stated}
     known = ["k2[<spring>]" if symbol == "k2" else symbol for symbol in sorted(rows, key=lambda s: rows[s].scatter)]
-    springs = sorted({table.settings.spring for table in tables if getattr(table.settings, "spring", None)})
-    priors, whole = dict[str, Prior](), not faults
+    springs = sorted({table.settings.spring for table in tables or () if getattr(table.settings, "spring", None)})
+    priors, whole = dict[str, Prior](), tables is not None and not faults
     for key in entries.value:
         node, spring = entries[key], re.fullmatch(rf"k2\[({NAME_PATTERN})\]", key)
         with collecting(faults):

@@ -297,6 +297,8 @@ class KindRule:
     meant : words of ``capsule_id.rig.guess`` for the forces of the file: the one that the kind takes, then others
     parameters : rows of the parameters that only experiments of this kind have
     bench : a bench test; else a forced run
+    test : the word for one test, a record or a row, in [plan]
+    minutes : what one test takes where [plan] states nothing, min
     read_by : what may be stated of the instruments of its columns, besides a clock: gain and offset
     divide : the number, from 0, of the part of a record that a row belongs to, (n,), -1 for none; each part is a record.
         Its arguments are the entry, columns in SI, and the settings. None: it stays whole
@@ -314,6 +316,8 @@ class KindRule:
     meant: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     bench: bool = True
+    test: str = ""
+    minutes: float = 1.0
     read_by: tuple[str, ...] = ()
     divide: Callable[[Node, Mapping[str, np.ndarray], Any], np.ndarray | None] | None = None
 
@@ -401,6 +405,7 @@ RIG_WORDS: Mapping[str, SettingRule] = {
 TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
     "[rig]": ("name", "synthetic", "confirmed", *RIG_QUANTITIES),
     "[model]": ("friction", "free", "reaction", "engine"),
+    "[plan]": ("minutes", "tests"),
 }
 #: Keys of ``[[instrument]]``.
 INSTRUMENT_KEYS = ("name", "gain", "offset", "clock")
@@ -460,6 +465,25 @@ def read_model(root: Node) -> ModelChoices:
         )
     in_order = tuple(symbol for symbol in OPTIONAL if symbol in free)
     return ModelChoices(free=in_order, **choices)
+
+
+def words_of_tests(kinds: Mapping[str, KindRule]) -> list[str]:
+    """The words for one test of each of ``kinds`` in [plan]."""
+    return [kind.test or name for name, kind in kinds.items()]
+
+
+def read_plan(root: Node, kinds: Mapping[str, KindRule]) -> dict[str, dict[str, float]]:
+    """Return ``minutes`` of one test and number of ``tests`` by word, of [plan]; {} where they are absent.
+
+    Raises
+    ------
+    InputError
+        If a key or word is unknown, or a number is not positive.
+    """
+    head = root.get("plan", {}).table("[plan]")
+    head.refuse_unknown(TABLE_KEYS["[plan]"], TABLE_KEYS)
+    stated = {key: head[key].table("{ push = 10 }", words_of_tests(kinds)) for key in head.value}
+    return {key: {word: node.number(word, 1.0, POSITIVE) for word in node.value} for key, node in stated.items()}
 
 
 def check_engine(root: Node, model: ModelChoices, tables: Sequence[Table[Any]]) -> None:

@@ -391,7 +391,7 @@ class Node:
         """``{ value = ..., sd = ..., unit = "..." }`` in SI; ``sd`` is refused unless ``has_sd``."""
         example = f'{{ value = ..., {"sd = ..., " if has_sd else ""}unit = "{si}" }}'
         factor = self.table(example, ("value", *(ERRORS if has_sd else ()), "unit")).unit(si)
-        number = self._scaled("value", factor, domain)
+        number = self.number("value", factor, domain)
         error = self._error(factor) if has_sd else None
         if error and si in WEIGHED and domain is POSITIVE and error[1] > 0.5 * number:
             rule, stated = f"sd of {self.key} must be at most half of its value", self[error[0]]
@@ -409,8 +409,8 @@ class Node:
             raise self["k"].error("k belongs to an expanded error", "no expanded", "add expanded = ...", of_key=True)
         if not words:
             return None
-        sds = {"sd": 1.0, "half_width": sqrt(3.0)}.get(words[0]) or self._scaled("k", 1.0, POSITIVE)
-        return words[0], self._scaled(words[0], factor, NOT_NEGATIVE) / sds
+        sds = {"sd": 1.0, "half_width": sqrt(3.0)}.get(words[0]) or self.number("k", 1.0, POSITIVE)
+        return words[0], self.number(words[0], factor, NOT_NEGATIVE) / sds
 
     def prior(self, si: str, default: Prior) -> Prior:
         """``{ median, factor, unit }``, ``{ scale, unit }`` or ``{ mean, sd, unit }``, by the kind of the default prior.
@@ -420,11 +420,11 @@ class Node:
         keys = PRIOR_KEYS[default.kind]
         self.table(f'{{ {"".join(f"{key} = ..., " for key in keys)}unit = "{si}" }}', (*keys, "unit"))
         factor = 1.0 if si == "1" and "unit" not in self else self.unit(si)
-        stated = [self._scaled(key, 1.0 if key == "factor" else factor, domain) for key, domain in keys.items()]
+        stated = [self.number(key, 1.0 if key == "factor" else factor, domain) for key, domain in keys.items()]
         location, spread = (0.0, *stated)[-2:]
         return replace(default, location=location, spread=spread)
 
-    def _scaled(self, key: str, factor: float, domain: Domain) -> float:
+    def number(self, key: str, factor: float, domain: Domain) -> float:
         """The number of ``key`` times ``factor``, finite and inside ``domain``."""
         stated, name = self.required(key, f"add {key} = ..."), self.key if key == "value" else f"{key} of {self.key}"
         number, zero = stated.value, "be 0 or " if domain.holds(0.0) else ""

@@ -138,7 +138,7 @@ def test_a_spring_is_chosen_by_name_and_other_laws_are_refused() -> None:
     with pytest.raises(InputError, match="spring must be a fitted one, hard, choose from soft, stiff"):
         tune(two, BOUNDS, GAP, spring="hard")
     two.provenance.friction = "karnopp.py"  # type: ignore[misc]
-    with pytest.raises(InputError, match=r"tune computes with eq\. \(1\)"):
+    with pytest.raises(InputError, match=r"this computes with eq\. \(1\)"):
         tune(two, BOUNDS, GAP)
 
 

@@ -509,6 +509,8 @@ KIND = Kind(
     masses=lambda table: ("m2",) if table.settings.drive == "base" else ("m1", "m2"),  # a prescribed rod needs no mass
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
     read_by=("gain",),
+    test="run",
+    minutes=5.0,
     make=lambda table, *rig: made_by(f"{PLACE}.drives:{RUNS_OF_DRIVES[table.settings.drive]}")(table, *rig),
     template=TEMPLATE,
     informs="all of them together, and the gap",

@@ -354,8 +354,8 @@ class CapsuleRun(CapsuleForward):
             early = time[..., :1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
             rest = (equilibrium(p), 0.0, 0.0, 0.0) if "slope" in self.ground else None
             run = self.simulated(theta, p, e, xp.concatenate([early, time], axis=-1), rest)
-            settled = {name: getattr(run, name)[1:] for name in ("times", "X1", "Y1", "X2", "Y2")}
-            X2 = settled["X2"][0]
+            settled = {name: getattr(run, name)[..., 1:] for name in ("times", "X1", "Y1", "X2", "Y2")}
+            X2 = settled["X2"][..., :1]
             return replace(run, **settled | {"X1": settled["X1"] - X2, "X2": settled["X2"] - X2})
         Y2 = self.moves * theta.get("capsule_start", 0.0) + 0.0 * theta["x_start"]
         initial = (theta["x_start"], theta.get("y_start", 0.0) + Y2, 0.0, Y2)

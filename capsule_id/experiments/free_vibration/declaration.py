@@ -344,6 +344,8 @@ KIND = Kind(
         DRIFT_RATIO,
         DRIFT_TIME,
     ),
+    test="free_vibration",
+    minutes=3.0,
     make=_make,
     check=_check_swings,
     template=TEMPLATE,

@@ -3,11 +3,13 @@
 A panel is ``(data, ax)`` and draws into ``ax``; labels are plain text.
 """
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
@@ -568,3 +570,24 @@ def traces(columns: SampledParameters, figure: Figure | SubFigure) -> None:
         panel.ticklabel_format(axis="y", useOffset=False, style="plain")
         panel.margins(x=0.01)
     figure.align_ylabels()
+
+
+#: Most rows of the ranking, and most letters of a line of their labels.
+_ROWS, _LETTERS = 10, 44
+
+
+def expected_sds(table: pd.DataFrame, targets: Sequence[str], title: str = "") -> Figure:
+    """Ratio of the expected to the present sd of every target after each of the best tests; see ``planning.Plan``."""
+    best, height = table.head(_ROWS)[::-1], 0.8 / len(targets)
+    figure = new_figure(8.6, 1.3 + 0.42 * len(best), left=4.2, top=0.62)
+    ax, rows = figure.subplots(), np.arange(len(best))
+    for i, name in enumerate(targets):
+        place = rows + 0.4 - (i + 0.5) * height
+        ax.barh(place, best[f"{name}, ratio"], height, color=CYCLE[i % len(CYCLE)], label=name)
+    ax.axvline(1.0, color=BLACK, lw=1.0, ls="--")
+    words = [textwrap.fill(f"{n}: {what}", _LETTERS) for n, what in zip(best["tests"], best["what"], strict=True)]
+    ax.set_yticks(rows, words, fontsize=SMALL, parse_math=False)
+    set_text(ax, "expected sd, parts of the present one", "")
+    figure.text(0.01, 0.99, title, fontsize=SMALL, va="top", fontweight="bold", parse_math=False)
+    set_legend(ax, "above")
+    return figure

@@ -1,0 +1,470 @@
+"""What a further test would add: expected standard deviations of parameters, from Fisher information at draws.
+
+A candidate is a number of tests of one kind that fit into the time. Its information at a draw of the parameters, with what
+only the new readings have integrated out, is added to the precision of the draws (Chaloner & Verdinelli, *Statistical
+Science* 10, 1995, 273). The expected sd is the mean over draws: nobody knows yet what the new readings will be.
+"""
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from capsule_id.console import OnProgress
+from capsule_id.errors import InputError
+from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.forced_run.experiment import CapsuleRun
+from capsule_id.experiments.kind import Kind, Registry, make_experiments
+from capsule_id.experiments.point_test import PointTest
+from capsule_id.inference.curvature import jacobian
+from capsule_id.inference.least_squares import linearised
+from capsule_id.inference.pipeline import check_readings, second_models
+from capsule_id.inference.prediction import random_draws, require_equation_1
+from capsule_id.inference.profiles import words_of
+from capsule_id.inference.result import Result
+from capsule_id.inference.target import LogPosterior, prior_sd
+from capsule_id.parameters import QUANTILE_975, by_index, is_stated, symbol_of
+from capsule_id.rig.model import Quantity, Rig
+from capsule_id.rig.read import read_rig
+from capsule_id.rig.schema import QuantityRule
+from capsule_id.synthetic import PAPER, Truth, synthesize
+
+#: Draws at which the information is computed, and the time for the tests, min.
+DRAWS, MINUTES = 8, 30.0
+#: Step of the differences of the residuals, natural-log units or parts of a prior's sd.
+STEP = 1e-4
+#: Most rows of a table whose information is computed; more tests multiply it.
+MOST_ROWS = 60
+#: Settings of a further test in parts of the smallest and the largest measured one; amplitudes in parts of the record's.
+BEYOND, AMPLITUDES = (0.5, 1.5), (0.5, 1.0, 2.0)
+#: Drive, frequency and gap of a further run in parts of those of a recorded one.
+DRIVES, FREQUENCIES, GAPS = (0.7, 1.0, 1.4), (0.8, 1.0, 1.25), (0.5, 1.0, 2.0)
+#: Least mean decrease of the logarithm of an sd with which tests share the time with others.
+LEAST = 0.01
+#: Largest part of the information by which its differences with steps of 1 and 2 may differ: the motion changes its kind.
+SMOOTH = 0.2
+
+#: Largest factor about the median of a prior within which a plan draws truths: farther away the synthetic tests do not fit.
+FACTOR = 1.5
+
+Values = Mapping[str, float]  # by name, SI
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Tests of one kind: ``template`` is one of their records, or a table of at most ``MOST_ROWS`` of their rows.
+
+    Attributes
+    ----------
+    words : what to do, such as "as decay_1, 2 x its amplitude"
+    tests, minutes : number of tests, and what all of them take
+    strength : information of all of them over that of the template
+    known : starts of a fit, for parameters of which a result knows nothing
+    changed : factors of symbols in the template, such as 1.4 of ``P_d``
+    """
+
+    template: Experiment
+    words: str
+    tests: int
+    minutes: float
+    strength: float
+    known: Values
+    changed: Values
+
+    def information(self, draws: Sequence[Values], names: Sequence[str]) -> np.ndarray:
+        """(draws, d, d) information on the parameters ``names`` in the coordinates of a fit; NaN where it has none."""
+        e, target = self.template, LogPosterior(self.template.rig, [self.template])
+        located = target.located
+        rows = [target.parameters[i] for i in located]
+        kept = [row.of != e.label or (row.physical and isinstance(e, PointTest)) for row in rows]
+        shared = np.array([row.name in names and keep for row, keep in zip(rows, kept, strict=True)])
+        place = [names.index(row.name) for row, keep in zip(rows, shared, strict=True) if keep]
+        found = np.zeros((len(draws), len(names), len(names)))
+        slopes = (self._of_run if isinstance(e, CapsuleRun) else self._of_readings)(target, draws)
+        for wide, slope in zip(found, slopes, strict=True):
+            whole = slope.T @ slope + np.diag(np.where(shared, 0.0, 1.0 / target.prior_sd[located] ** 2))
+            own, cross = whole[~shared][:, ~shared], whole[~shared][:, shared]
+            wide[np.ix_(place, place)] = whole[shared][:, shared] - cross.T @ np.linalg.solve(own, cross)
+        return self.strength * found
+
+    def _values(self, target: LogPosterior, draw: Values) -> dict[str, float]:
+        """Values of all parameters of the template at a draw, constants included."""
+        known = {**target.fixed, **{name: float(draw.get(name, self.known[name])) for name in target.names}}
+        return {name: x * self.changed.get(symbol_of(name), 1.0) for name, x in known.items()}
+
+    def _of_readings(self, target: LogPosterior, draws: Sequence[Values]) -> Iterator[np.ndarray]:
+        """Jacobian of the residuals with respect to the located parameters, at each draw."""
+        located, step = target.located, STEP * np.minimum(target.prior_sd, 1.0)
+        for draw in draws:
+            values = self._values(target, draw)
+            u = target.unconstrain(np.array([values[name] for name in target.names]))
+            if self.template.event_driven:
+                yield linearised(target, u)[1][: -target.dimension]
+                continue
+            e = _as_predicted(self.template, values)
+
+            def residuals(v: np.ndarray, e: Experiment = e, u: np.ndarray = u) -> np.ndarray:
+                at = u.copy()
+                at[located] = v
+                return np.asarray(e.residuals(e.local(target.mapping(target.theta(at))), np))
+
+            yield jacobian(residuals, u[located], step[located])
+
+    def _of_run(self, target: LogPosterior, draws: Sequence[Values]) -> Iterator[np.ndarray]:
+        """The same for a run: motions at all draws and steps are one batch; its offsets are integrated out."""
+        e: Any = self.template
+        located, step = target.located, STEP * np.minimum(target.prior_sd, 1.0)
+        at = [self._values(target, draw) for draw in draws]
+        u = np.stack([target.unconstrain(np.array([values[name] for name in target.names])) for values in at])
+        moves = np.concatenate([size * np.diag(step)[located] for size in (1.0, -1.0, 2.0, -2.0)])
+        theta = target.theta((u[:, None] + moves).reshape(-1, target.dimension))
+        constants = {name: np.full(len(theta), x) for name, x in target.fixed.items()}
+        seen = e.predict(e.local({**constants, **dict(zip(target.names, theta.T, strict=True))}), np)
+        for k, values in enumerate(at):
+            part, columns = slice(k * len(moves), (k + 1) * len(moves)), []
+            noise = [values[f"noise_{name}[{e.shares_noise}]"] for name in e.names]
+            for channel, sd in zip(seen, noise, strict=True):
+                ahead, behind, far, further = np.split(np.asarray(channel)[part], 4)
+                one, two = ((a - b) / (2.0 * step[located, None]) for a, b in ((ahead, behind), (far, further)))
+                columns.append(np.stack([one, 0.5 * two]) / sd)
+            near, wide = np.concatenate([each - each.mean(axis=2, keepdims=True) for each in columns], axis=2)
+            smooth = np.linalg.norm(near - wide) <= SMOOTH * np.linalg.norm(near)
+            yield near.T if smooth else np.full_like(near.T, np.nan)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Candidates in the order of their use.
+
+    Attributes
+    ----------
+    table : a row per candidate, best first: kind, what to do, number, minutes, and for every target the expected sd
+        (``sd of c``, SI) and its ratio to the present one (``c, ratio``)
+    today : sd of every target, SI, by name
+    options : the tests of every row of the table; those of two kinds share the time
+    left_out : tests that take longer than the time, and runs whose motion changes its kind near the setting
+    """
+
+    table: pd.DataFrame
+    today: Values
+    options: tuple[tuple[Candidate, ...], ...]
+    left_out: tuple[str, ...]
+    registry: Registry
+
+    def lines(self, rank: int = 1) -> str:
+        """Lines of rig.toml that read the tests of that row of the table."""
+        own = (lines_of(one.template, self.registry[one.template.kind]) for one in self.options[rank - 1])
+        return "\n\n".join(own)
+
+
+def _as_predicted(e: Experiment, values: Values) -> Experiment:
+    """A table of trials with the readings that ``values`` predict; other experiments as they are."""
+    reading = getattr(e, "reading", "")
+    if not isinstance(e, PointTest) or reading not in e.table.columns:
+        return e
+    return _remade(e, {reading: e.observed - np.asarray(e.misfit(e.local(values)).raw)}, np.arange(e.n))
+
+
+def _remade(e: PointTest, changed: Mapping[str, np.ndarray], rows: np.ndarray) -> PointTest:
+    """The test with ``rows`` of its table and with other values of some columns."""
+    columns = {name: replace(c, values=changed.get(name, c.values)[rows]) for name, c in e.table.columns.items()}
+    table = replace(e.table, columns=columns, rows=np.arange(1, len(rows) + 1))
+    return type(e).make(table, e.rig, e.friction)[0]  # type: ignore[return-value]  # pyright: ignore
+
+
+def _designs(e: PointTest, kind: Kind) -> Iterator[tuple[str, Mapping[str, np.ndarray], np.ndarray]]:
+    """Which rows of its table, and with what settings, further trials may have: words, changed columns, rows."""
+    yield "", {}, np.arange(e.n)
+    column = next((c for c in e.table.columns.values() if c.name != e.reading), None)
+    if column is None or np.ptp(column.values) == 0.0:
+        return
+    order = np.argsort(column.values, kind="stable")
+
+    def words(*values: float) -> str:
+        return f", {column.name} {' and '.join(f'{x * column.to_display:.3g}' for x in values)} {column.unit}"
+
+    low, high = (float(column.values[i]) for i in order[[0, -1]])
+    yield words(low, high), {}, order[[0, -1]]
+    for value, row in ((low, order[:1]), (high, order[-1:])):
+        yield words(value), {}, row
+    if kind.set_by == column.name:
+        for part, value, row in ((BEYOND[0], low, order[:1]), (BEYOND[1], high, order[-1:])):
+            yield words(part * value), {column.name: part * column.values}, row
+
+
+def _runs(e: CapsuleRun) -> Iterator[tuple[str, Experiment, Values]]:
+    """Settled runs at other settings, and as recorded: words, the run, factors of its drive and gap."""
+    settings = e.table.settings
+    if settings.drive != "harmonic":
+        yield "", e, {}
+        return
+    for drive, rate, gap in product(DRIVES, FREQUENCIES, GAPS):
+        if (gap != 1.0 and (drive, rate) != (1.0, 1.0)) or (gap != 1.0 and settings.gap is None):
+            continue
+        own = {"start": "settled", "Omega": rate * e.Omega, "f": None}
+        own |= {} if settings.gap is None else {"gap": Quantity(gap * settings.gap.value, settings.gap.sd)}
+        own |= {} if settings.P_d is None else {"P_d": Quantity(drive * settings.P_d.value, drive * settings.P_d.sd)}
+        parts = {"x its drive": drive, "x its frequency": rate, "x its gap": gap}
+        words = "".join(f", {x:g} {word}" for word, x in parts.items() if x != 1.0)
+        changed = {"I_d": drive, "P_d": drive, "G": gap}
+        yield words, e.remade(replace(e.table, settings=replace(settings, **own)), leads=True), changed
+
+
+def candidates(
+    made: Sequence[Experiment], rig: Rig, registry: Registry, minutes: float
+) -> tuple[list[Candidate], list[str]]:
+    """What may be measured in the time like the experiments ``made``, the first of each kind and spring.
+
+    Also return what takes longer than that.
+    """
+    found, left_out, seen = list[Candidate](), list[str](), set[tuple[Any, ...]]()
+    for e in made:
+        kind, own = (
+            registry[e.kind],
+            (e.kind, getattr(e.table.settings, "spring", None) if e.bench else None, *e.table.columns),
+        )
+        each = rig.plan.get("minutes", {}).get(kind.test or kind.name, kind.minutes)
+        number = int(minutes / each)
+        if own in seen or not number:
+            left_out += [f"{e.label} ({each:g} min)"] if own not in seen else []
+            continue
+        seen.add(own)
+        starts = {name: start.centre for name, start in LogPosterior(e.rig, [e]).starts().items()}
+        about = (number, number * each)
+        if isinstance(e, PointTest):
+            for words, changed, rows in _designs(e, kind):
+                chosen = np.resize(rows, max(min(number, MOST_ROWS), len(rows)))
+                template, strength = _remade(e, changed, chosen), number / len(chosen)
+                found.append(Candidate(template, f"as {e.label}{words}", *about, strength, starts, {}))
+        elif isinstance(e, CapsuleRun):
+            found += [
+                Candidate(run, f"as {e.label}{words}", *about, number, starts, own) for words, run, own in _runs(e)
+            ]
+        else:
+            strength = number if e.time_series else number / e.n
+            for part in AMPLITUDES if e.proportional else (1.0,):
+                words = f"as {e.label}" + (f", {part:g} x its amplitude" if part != 1.0 else "")
+                found.append(Candidate(e, words, *about, strength * part**2, starts, {}))
+    return found, left_out
+
+
+def twins(known: Values, rig: Rig, kinds: Sequence[Kind], registry: Registry, seed: int) -> list[Experiment]:
+    """Experiments of ``kinds`` as the synthetic rig has them, at values by name, SI, with masses and priors of ``rig``."""
+    if not kinds:
+        return []
+    truth = Truth(
+        {name: x for name, x in PAPER.items() if not (by_index("k2", known) and symbol_of(name) == "k2")} | dict(known)
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        synthesize(Path(folder) / "next", seed, truth, "next", registry=Registry(tuple(kinds)))
+        read = read_rig(Path(folder) / "next", registry)
+    own = {
+        "m1": rig.m1 or read.m1,
+        "m2": rig.m2 or read.m2,
+        "g": rig.g,
+        "model": rig.model,
+        "priors": rig.priors,
+        "plan": rig.plan,
+    }
+    return list(make_experiments(replace(read, **own), "all", registry))
+
+
+def lines_of(e: Experiment, kind: Kind) -> str:
+    """The entry of rig.toml that reads tests like ``e``: its settings and reading errors, in SI units."""
+    settings, columns = e.table.settings, e.table.columns.values()
+    shown = {"kind": json.dumps(kind.name), "file": json.dumps(f"{kind.name}_next.csv")}
+    for one in fields(settings):
+        value, rule = getattr(settings, one.name), kind.setting_rules[one.name]
+        if value == one.default or value is None:
+            continue
+        if isinstance(rule, QuantityRule):
+            shown[one.name] = _quantity(value if isinstance(value, Quantity) else Quantity(value), rule.si)
+        else:
+            shown[one.name] = json.dumps(value)
+    for column in columns:
+        stated = {"sd": column.sd, "resolution": column.resolution}
+        unit = "s" if column.name == "time" else kind.columns[column.name].si
+        shown |= {f"{column.name}_{key}": _quantity(Quantity(x), unit) for key, x in stated.items() if x is not None}
+    header = ", ".join(f"{column.name} [{column.unit}]" for column in columns)
+    return "\n".join(["[[experiment]]", *(f"{key} = {text}" for key, text in shown.items()), f"# columns: {header}"])
+
+
+def _quantity(quantity: Quantity, unit: str) -> str:
+    error = f", sd = {quantity.sd:.6g}" if quantity.sd else ""
+    return f'{{ value = {quantity.value:.6g}{error}, unit = "{unit}" }}'
+
+
+def next_tests(
+    result: Result,
+    targets: Sequence[str] = (),
+    *,
+    minutes: float = MINUTES,
+    draws: int = DRAWS,
+    seed: int = 0,
+    progress: OnProgress | None = None,
+) -> Plan:
+    """Rank further tests by the sd that they leave: the geometric mean over the targets of expected over present sd.
+
+    Tests of two kinds that share the time stand beside those of one kind. The sd of a test that needs a parameter whose
+    readings the rig does not have counts with its default prior.
+
+    Parameters
+    ----------
+    result : of a sampled fit
+    targets : names of parameters; () for all that are not stated
+    minutes : time for the tests; what one of them takes stands in [plan] of rig.toml, or is the default of its kind
+    draws, seed : number of draws of the posterior, and the seed of their choice
+
+    Raises
+    ------
+    InputError
+        If nothing was sampled or another friction law was fitted, a target is not a physical parameter of the fit, or the
+        time is too short for any test.
+    """
+    require_equation_1(result)
+    chosen = random_draws(result, draws, np.random.default_rng(seed))
+    assert result.posterior is not None, "draws were taken"
+    names, known = list(chosen), [str(name) for name in result.summary.index if not is_stated(str(name))]
+    targets = list(dict.fromkeys(targets)) or known
+    for name in targets:
+        if name not in known:
+            raise InputError("a target must be a parameter of the fit", name, f"choose from {', '.join(known)}")
+    rig, registry, choice = result.rig, result.registry, result.provenance.experiments
+    made, _ = second_models(make_experiments(rig, choice, registry), check_readings(rig, choice, registry))
+    measured = {e.kind for e in made}
+    lacking = [kind for kind in registry.kinds if kind.bench and kind.twin and kind.name not in measured]
+    value, today = (dict(zip(map(str, result.summary.index), result.summary[c], strict=True)) for c in ("value", "sd"))
+    medians = {name: float(x) for name, x in value.items() if name in PAPER or symbol_of(name) == "k2"}
+    found, left_out = candidates([*made, *twins(medians, rig, lacking, registry, seed)], rig, registry, minutes)
+    if not found:
+        raise InputError("a test must fit into the time", f"{minutes:g} min", "give more minutes")
+    target, sample = LogPosterior(rig, made), result.posterior.draws.reshape(-1, len(names))
+    positive = np.isin(names, [name for name, sign in zip(target.names, target.positive, strict=True) if sign])
+    precision = np.linalg.inv(np.cov(np.where(positive, np.log(np.where(positive, sample, 1.0)), sample).T))
+    values = [dict(zip(names, row, strict=True)) for row in zip(*chosen.values(), strict=True)]
+    place = [names.index(name) for name in targets]
+
+    def sds(information: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.diagonal(np.linalg.inv(precision + information), axis1=1, axis2=2)[:, place]).mean(axis=0)
+
+    options, best = list[tuple[tuple[Candidate, ...], np.ndarray]](), dict[str, tuple[float, Candidate, np.ndarray]]()
+    before = sds(np.zeros((1, *precision.shape)))
+    for done, one in enumerate(found):
+        if progress is not None:
+            progress(done, len(found), "test")
+        information = one.information(values, names)
+        if not np.isfinite(information).all():
+            left_out.append(f"{one.words} (its motion changes its kind near the setting)")
+            continue
+        options.append(((one,), sds(information) / before))
+        worth = _worth(options[-1])
+        if worth < best.get(one.template.kind, (-LEAST,))[0]:
+            best[one.template.kind] = worth, one, information
+    for (_, one, own), (_, other, further) in combinations(best.values(), 2):
+        if one.tests > 1 and other.tests > 1:
+            options.append(((one, other), sds(0.5 * (own + further)) / before))
+    options.sort(key=_worth)
+    today = {name: float(today[name]) for name in targets}
+    rows = [_row(members, today, ratios) for members, ratios in options]
+    table = pd.DataFrame(rows, index=pd.RangeIndex(1, len(rows) + 1))
+    return Plan(table, today, tuple(members for members, _ in options), tuple(left_out), registry)
+
+
+def _worth(option: tuple[Any, np.ndarray]) -> float:
+    """Mean logarithm of the ratios: the smaller, the better."""
+    return float(np.mean(np.log(option[1])))
+
+
+def _row(members: Sequence[Candidate], today: Values, ratios: np.ndarray) -> dict[str, Any]:
+    """The row of ``Plan.table`` for tests that share the time."""
+    pairs = list(zip(today.items(), ratios.tolist(), strict=True))
+    return {
+        "kind": " + ".join(one.template.kind for one in members),
+        "tests": " + ".join(str(one.tests // len(members)) for one in members),
+        "what": "; ".join(one.words for one in members),
+        "minutes": float(np.mean([one.minutes for one in members])),
+        **{f"sd of {name}": sd * ratio for (name, sd), ratio in pairs},
+        **{f"{name}, ratio": ratio for (name, _), ratio in pairs},
+    }
+
+
+def planned(folder: str | Path, registry: Registry, draws: int = DRAWS, seed: int = 0) -> tuple[pd.DataFrame, float]:
+    """What the tests of [plan] would show of every parameter, before any of them is made, and the minutes that they take.
+
+    Truths are drawn from the priors, within a factor of ``FACTOR`` of their medians. The tests are those of the synthetic rig,
+    with its reading errors.
+
+    Parameters
+    ----------
+    folder : holds ``rig.toml`` with the masses, [plan] tests = { push = 10, free_vibration = 3 }, and perhaps [prior]; the
+        files of its experiments need not exist
+
+    Returns
+    -------
+    A row per parameter: ``known`` in the words of ``identified``, sd over prior sd, and sd over value where it is positive.
+
+    Raises
+    ------
+    InputError
+        If rig.toml breaks a rule, states no tests or no mass, or plans a kind that the synthetic rig does not have.
+    """
+    rig = read_rig(folder, registry, planned=True)
+    place, tests = rig.folder / "rig.toml", rig.plan.get("tests", {})
+    by_word = {kind.test or kind.name: kind for kind in registry.kinds}
+    known = [word for word, kind in by_word.items() if kind.bench and kind.twin]
+    for word in tests:
+        if word not in known:
+            raise InputError(
+                "[plan] tests can be planned for bench tests", word, f"choose from {', '.join(known)}", place
+            )
+    if not tests or rig.m1 is None or rig.m2 is None:
+        rule = "a plan needs m1 and m2 in [rig], and tests in [plan]"
+        raise InputError(rule, "not all of them", "write [plan] tests = { push = 10, free_vibration = 3 }", place)
+    rng, kinds = np.random.default_rng(seed), [by_word[word] for word in tests]
+    covariances, rows = list[np.ndarray](), list[Any]()
+    for i in range(draws):
+        made = twins(_drawn(rig, registry, rng), rig, kinds, registry, seed + i)
+        target = LogPosterior(rig, made)
+        rows = [row for row in target.parameters if row.physical and not row.scatter]
+        names = [row.name for row in rows]
+        precision = np.diag(1.0 / np.array([prior_sd(row) for row in rows]) ** 2)
+        values = {name: start.centre for name, start in target.starts().items()}
+        for e in made:
+            number = tests[registry[e.kind].test or e.kind]
+            chosen = (
+                np.resize(np.arange(e.n), max(int(min(number, MOST_ROWS)), e.n)) if isinstance(e, PointTest) else None
+            )
+            template = e if chosen is None else _remade(e, {}, chosen)  # type: ignore[arg-type]  # pyright: ignore
+            alike = 1 if chosen is not None else sum(other.kind == e.kind for other in made)
+            strength = number / (alike if chosen is None else len(chosen))
+            precision = (
+                precision + Candidate(template, "", 1, 1.0, strength, values, {}).information([values], names)[0]
+            )
+        covariances.append(np.linalg.inv(precision))
+    sds, prior = np.sqrt([np.diag(each) for each in covariances]), np.array([prior_sd(row) for row in rows])
+    frame = words_of([row.name for row in rows], np.mean(covariances, axis=0), np.mean(sds, axis=0) / prior)
+    frame["sd / value"] = [float(np.mean(sds[:, i])) if row.positive else np.nan for i, row in enumerate(rows)]
+    stated = rig.plan.get("minutes", {})
+    return frame, sum(number * stated.get(word, by_word[word].minutes) for word, number in tests.items())
+
+
+def _drawn(rig: Rig, registry: Registry, rng: np.random.Generator) -> dict[str, float]:
+    """Truths of a planned rig by name, SI; the masses are the stated ones."""
+    springs = [name for name in rig.priors if symbol_of(name) == "k2"] or [
+        name for name in PAPER if symbol_of(name) == "k2"
+    ]
+    drawn = {"m1": rig.mass("m1"), "m2": rig.mass("m2"), "g": rig.g.value}
+    for name in ("k1", "c", "mu", "v_s", "K", *springs):
+        prior = rig.priors.get(name) or registry.parameters[symbol_of(name)].prior
+        assert prior is not None, "it has a default prior"
+        width = np.log(min(prior.spread, FACTOR)) / QUANTILE_975
+        drawn[name] = float(
+            prior.location * np.exp(width * np.clip(rng.standard_normal(), -QUANTILE_975, QUANTILE_975))
+        )
+    return drawn
