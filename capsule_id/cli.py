@@ -4,12 +4,13 @@ import argparse
 import re
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import NoReturn, TextIO
 
 from capsule_id import console
 from capsule_id.commands import add_options
@@ -61,72 +62,36 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _commands() -> tuple[tuple[str, Any, str, str], ...]:
-    """Name, module, help and example of each command."""
-    from capsule_id.commands import (
-        bifurcate,
-        check,
-        fit,
-        import_file,
-        init,
-        next,
-        plan,
-        predict,
-        report,
-        simulate,
-        synthesize,
-        tune,
-    )
-
-    return (
-        (
-            "init",
-            init,
-            "a rig folder with a commented rig.toml, or one that reads given exports",
-            "my-rig --from decay.csv",
-        ),
-        ("import", import_file, "print the entry that reads an export", "decay.csv"),
-        ("check", check, "check a rig folder and list problems before a fit", "my-rig --figures figures"),
-        ("fit", fit, "fit a rig folder, as fit-params does", "my-rig --seed 1"),
-        ("synthesize", synthesize, "a rig folder with known truth", "twin --seed 1 --set k1=1500"),
-        (
-            "simulate",
-            simulate,
-            "the capsule model: time histories and phase plane",
-            "--k2 18960 --G 0.001 --P_d 4 --Omega 34.56 --out motion.csv",
-        ),
-        (
-            "bifurcate",
-            bifurcate,
-            "the settled motions over one quantity or two: bifurcation diagrams and maps",
-            "--over k2 --from 1 --to 55 --unit kN/m",
-        ),
-        (
-            "predict",
-            predict,
-            "displacements of a capsule robot at new settings, from a result",
-            "results/robot settings.csv --out predicted.csv",
-        ),
-        (
-            "tune",
-            tune,
-            "the settings of drive and rig with the largest mean velocity, from a result",
-            "results/twin --P_d 1 6 --Omega 20 50 --G 0.001 --spring soft --out tuned.csv",
-        ),
-        ("plan", plan, "what planned tests would show, from the priors, before they are made", "my-rig"),
-        (
-            "next",
-            next,
-            "further tests, ranked by the uncertainty that they leave, from a result",
-            "results/twin --for c,v_s --minutes 30",
-        ),
-        (
-            "report",
-            report,
-            "the parameter table and findings of a result, or several side by side",
-            "results/rig-a results/rig-b",
-        ),
-    )
+#: Help and example of each command.
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "init": ("a rig folder with a commented rig.toml, or one that reads given exports", "my-rig --from decay.csv"),
+    "import": ("print the entry that reads an export", "decay.csv"),
+    "check": ("check a rig folder and list problems before a fit", "my-rig --figures figures"),
+    "fit": ("fit a rig folder, as fit-params does", "my-rig --seed 1"),
+    "synthesize": ("a rig folder with known truth", "twin --seed 1 --set k1=1500"),
+    "simulate": (
+        "the capsule model: time histories and phase plane",
+        "--k2 18960 --G 0.001 --P_d 4 --Omega 34.56 --out motion.csv",
+    ),
+    "bifurcate": (
+        "the settled motions over one quantity or two: bifurcation diagrams and maps",
+        "--over k2 --from 1 --to 55 --unit kN/m",
+    ),
+    "predict": (
+        "displacements of a capsule robot at new settings, from a result",
+        "results/robot settings.csv --out predicted.csv",
+    ),
+    "tune": (
+        "the settings of drive and rig with the largest mean velocity, from a result",
+        "results/twin --P_d 1 6 --Omega 20 50 --G 0.001 --spring soft --out tuned.csv",
+    ),
+    "plan": ("what planned tests would show, from the priors, before they are made", "my-rig"),
+    "next": (
+        "further tests, ranked by the uncertainty that they leave, from a result",
+        "results/twin --for c,v_s --minutes 30",
+    ),
+    "report": ("the parameter table and findings of a result, or several side by side", "results/rig-a results/rig-b"),
+}
 
 
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
@@ -134,7 +99,8 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
     parser = _parser(program, "Make, check, fit, simulate and report.", example)
     parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)
     commands = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
-    for name, module, text, example in _commands():
+    for name, (text, example) in COMMANDS.items():
+        module = import_module(f"capsule_id.commands.{'import_file' if name == 'import' else name}")
         example = f"example: %(prog)s {example}"
         sub = commands.add_parser(name, help=text, description=text, epilog=example, allow_abbrev=False)
         add_options(sub, module.OPTIONS)

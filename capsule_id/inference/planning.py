@@ -311,8 +311,7 @@ def next_tests(
 ) -> Plan:
     """Rank further tests by the sd that they leave: the geometric mean over the targets of expected over present sd.
 
-    Tests of two kinds that share the time stand beside those of one kind. The sd of a test that needs a parameter whose
-    readings the rig does not have counts with its default prior.
+    Tests of two kinds that share the time stand beside those of one kind.
 
     Parameters
     ----------
@@ -330,23 +329,9 @@ def next_tests(
     require_equation_1(result)
     chosen = random_draws(result, draws, np.random.default_rng(seed))
     assert result.posterior is not None, "draws were taken"
-    names, known = list(chosen), [str(name) for name in result.summary.index if not is_stated(str(name))]
-    targets = list(dict.fromkeys(targets)) or known
-    for name in targets:
-        if name not in known:
-            raise InputError("a target must be a parameter of the fit", name, f"choose from {', '.join(known)}")
-    rig, registry, choice = result.rig, result.registry, result.provenance.experiments
-    made, _ = second_models(make_experiments(rig, choice, registry), check_readings(rig, choice, registry))
-    measured = {e.kind for e in made}
-    lacking = [kind for kind in registry.kinds if kind.bench and kind.twin and kind.name not in measured]
-    value, today = (dict(zip(map(str, result.summary.index), result.summary[c], strict=True)) for c in ("value", "sd"))
-    medians = {name: float(x) for name, x in value.items() if name in PAPER or symbol_of(name) == "k2"}
-    found, left_out = candidates([*made, *twins(medians, rig, lacking, registry, seed)], rig, registry, minutes)
-    if not found:
-        raise InputError("a test must fit into the time", f"{minutes:g} min", "give more minutes")
-    target, sample = LogPosterior(rig, made), result.posterior.draws.reshape(-1, len(names))
-    positive = np.isin(names, [name for name, sign in zip(target.names, target.positive, strict=True) if sign])
-    precision = np.linalg.inv(np.cov(np.where(positive, np.log(np.where(positive, sample, 1.0)), sample).T))
+    targets = _targets(result, targets)
+    made, found, left_out = _candidates_of(result, minutes, seed)
+    names, precision = list(chosen), _precision(result.posterior.draws, LogPosterior(result.rig, made), list(chosen))
     values = [dict(zip(names, row, strict=True)) for row in zip(*chosen.values(), strict=True)]
     place = [names.index(name) for name in targets]
 
@@ -356,7 +341,7 @@ def next_tests(
     options, best = list[tuple[tuple[Candidate, ...], np.ndarray]](), dict[str, tuple[float, Candidate, np.ndarray]]()
     before = sds(np.zeros((1, *precision.shape)))
     for done, one in enumerate(found):
-        if progress is not None:
+        if progress:
             progress(done, len(found), "test")
         information = one.information(values, names)
         if not np.isfinite(information).all():
@@ -370,10 +355,42 @@ def next_tests(
         if one.tests > 1 and other.tests > 1:
             options.append(((one, other), sds(0.5 * (own + further)) / before))
     options.sort(key=_worth)
-    today = {name: float(today[name]) for name in targets}
+    today = {name: float(x) for name, x in zip(targets, result.summary["sd"][targets], strict=True)}
     rows = [_row(members, today, ratios) for members, ratios in options]
     table = pd.DataFrame(rows, index=pd.RangeIndex(1, len(rows) + 1))
-    return Plan(table, today, tuple(members for members, _ in options), tuple(left_out), registry)
+    return Plan(table, today, tuple(members for members, _ in options), tuple(left_out), result.registry)
+
+
+def _targets(result: Result, wanted: Sequence[str]) -> list[str]:
+    """The parameters to know better: those ``wanted``, or all that are not stated."""
+    known = [str(name) for name in result.summary.index if not is_stated(str(name))]
+    for name in wanted:
+        if name not in known:
+            raise InputError("a target must be a parameter of the fit", name, f"choose from {', '.join(known)}")
+    return list(dict.fromkeys(wanted)) or known
+
+
+def _candidates_of(
+    result: Result, minutes: float, seed: int
+) -> tuple[tuple[Experiment, ...], list[Candidate], list[str]]:
+    """The experiments of a fit, what may be measured besides, and what takes too long."""
+    rig, registry, choice = result.rig, result.registry, result.provenance.experiments
+    made, _ = second_models(make_experiments(rig, choice, registry), check_readings(rig, choice, registry))
+    measured = {e.kind for e in made}
+    lacking = [kind for kind in registry.kinds if kind.bench and kind.twin and kind.name not in measured]
+    values = {str(name): float(x) for name, x in zip(result.summary.index, result.summary["value"], strict=True)}
+    medians = {name: x for name, x in values.items() if name in PAPER or symbol_of(name) == "k2"}
+    found, left_out = candidates([*made, *twins(medians, rig, lacking, registry, seed)], rig, registry, minutes)
+    if not found:
+        raise InputError("a test must fit into the time", f"{minutes:g} min", "give more minutes")
+    return made, found, left_out
+
+
+def _precision(draws: np.ndarray, target: LogPosterior, names: Sequence[str]) -> np.ndarray:
+    """(d, d) inverse covariance of draws (..., d) of ``names``, in the coordinates of ``target``."""
+    positive = np.isin(names, [name for name, sign in zip(target.names, target.positive, strict=True) if sign])
+    sample = draws.reshape(-1, len(names))
+    return np.linalg.inv(np.cov(np.where(positive, np.log(np.where(positive, sample, 1.0)), sample).T))
 
 
 def _worth(option: tuple[Any, np.ndarray]) -> float:
