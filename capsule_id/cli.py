@@ -90,6 +90,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "further tests, ranked by the uncertainty that they leave, from a result",
         "results/twin --for c,v_s --minutes 30",
     ),
+    "calibrate": ("fit rigs with known truth, and test the ranks of the truth", "calibration --rigs 60"),
     "report": ("the parameter table and findings of a result, or several side by side", "results/rig-a results/rig-b"),
 }
 

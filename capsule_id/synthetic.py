@@ -13,13 +13,13 @@ import pandas as pd
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, Registry, default_registry
 from capsule_id.output import replace_files
-from capsule_id.parameters import SPRINGS, TABLE, TABLE_1
+from capsule_id.parameters import SPRINGS, TABLE, TABLE_1, Prior, symbol_of
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import friction_law, scaled
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.physics.simulation import displacement
 from capsule_id.rig.model import Rig
-from capsule_id.rig.toml import NAME_PATTERN
+from capsule_id.rig.toml import NAME_PATTERN, PRIOR_KEYS
 
 #: Table 1 and three springs of the paper, SI by name.
 PAPER: Mapping[str, float] = {
@@ -66,6 +66,7 @@ def synthesize(
     name: str | None = None,
     runs: bool = False,
     registry: Registry | None = None,
+    priors: Mapping[str, Prior] | None = None,
 ) -> Truth:
     """Write a rig folder computed from ``truth`` and, beside it, ``<folder>.truth.json``.
 
@@ -77,6 +78,7 @@ def synthesize(
     name : of the rig (default: the name of the folder)
     runs : add forced runs of the exact model, with their additional springs
     registry : the kinds to measure (default: all with a twin)
+    priors : those of all masses and of ``[prior]``, SI. Default: masses scatter about the truth
 
     Raises
     ------
@@ -95,17 +97,20 @@ def synthesize(
     of_runs = {name for kind in known_kinds if not kind.bench for name in kind.truth}
     on_bench = {name: value for name, value in truth.items() if name not in of_runs}
     twins = [(k, k.twin(on_bench if k.bench else dict(truth), rng, seed)) for k in kinds if k.twin is not None]
-    masses = {symbol: truth[symbol] + sd * rng.standard_normal() for symbol, sd in MASS_SD.items()}
+    masses = {
+        symbol: truth[symbol] + sd * rng.standard_normal() if priors is None else priors[symbol].location
+        for symbol, sd in MASS_SD.items()
+    }
     entries = [
         "\n".join(["[[experiment]]", f'kind = "{kind.name}"', f'file = "{table.file}"', *table.settings, ""])
         for kind, twin in twins
         for table in twin.tables
     ]
-    priors = [line for _, twin in twins for line in twin.priors]
+    stated = [line for _, twin in twins for line in twin.priors] if priors is None else _prior_lines(priors)
     behind = {label: known for _, twin in twins for label, known in twin.truth.items()}
     tables = {table.file: table.columns for _, twin in twins for table in twin.tables}
     known = {"seed": seed, "parameters": truth, **({"runs": behind} if behind else {})}
-    head = [f'g = {{ value = {truth["g"]:g}, unit = "m/s^2" }}', "", *(["[prior]", *priors, ""] if priors else [])]
+    head = [f'g = {{ value = {truth["g"]:g}, unit = "m/s^2" }}', "", *(["[prior]", *stated, ""] if stated else [])]
     _write(folder, tables, _rig_toml(name, seed, masses, MASS_SD, [*head, *entries]), known)
     return truth
 
@@ -139,6 +144,24 @@ def truth_beside(rig: Rig) -> dict[str, float]:
 
 def _truth_file(folder: Path) -> Path:
     return folder.resolve().with_name(folder.resolve().name + ".truth.json")
+
+
+def _prior_lines(priors: Mapping[str, Prior]) -> list[str]:
+    """Lines of ``[prior]``, SI, without the masses."""
+    return [
+        " ".join(
+            [
+                f'"{name}" = {{',
+                *(
+                    f"{key} = {prior.location if key == 'median' else prior.spread!r},"
+                    for key in PRIOR_KEYS[prior.kind]
+                ),
+                f'unit = "{default_registry().parameters[symbol_of(name)].unit}" }}',
+            ]
+        )
+        for name, prior in priors.items()
+        if name not in MASS_SD
+    ]
 
 
 def _rig_toml(name: str, seed: int, masses: Mapping[str, float], sds: Mapping[str, float], lines: Iterable[str]) -> str:

@@ -6,11 +6,11 @@ import sys
 import time
 from argparse import Namespace
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH, QUIET, rig_folders
@@ -79,7 +79,7 @@ def fingerprint_of(rig: Rig, options: Namespace, kinds: Registry) -> Mapping[str
 
 
 def make_fit(
-    rig: Rig,
+    rig: Rig | Path,
     options: Namespace,
     kinds: Registry,
     store: Path | None = None,
@@ -176,10 +176,13 @@ def fit_many(
         make_experiments(rig, options.experiments, kinds)
     failures, unclean = list[str](), list[str]()
     with client_of(scheduler) as client:
-        fits = ((rig, partial(fitted_rig, rig, options, root, kinds)) for rig in rigs)
         progress(0, len(rigs), "rigs")
         for done, (rig, fitted) in enumerate(
-            fits if client is None else _on_cluster(client, rigs, options, root), start=1
+            # A worker has the kinds that are installed there.
+            each_result(
+                client, partial(fitted_rig, options=options, root=root, kinds=kinds if client is None else None), rigs
+            ),
+            start=1,
         ):
             try:
                 files, line, clean = fitted()
@@ -200,8 +203,8 @@ def fit_many(
     return FAILED if failures else NOT_CLEAN if unclean else CLEAN
 
 
-def fitted_rig(rig: Rig, options: Namespace, root: Path, kinds: Registry | None = None) -> FittedRig:
-    """Fit one rig, which is written to ``root``/<rig name>; on a worker with the kinds installed there.
+def fit_by_worker(rig: Rig | Path, options: Namespace, kinds: Registry | None = None) -> "cid.Fit":
+    """``make_fit`` without progress, on a worker with the kinds installed there.
 
     Raises
     ------
@@ -209,22 +212,31 @@ def fitted_rig(rig: Rig, options: Namespace, root: Path, kinds: Registry | None 
         If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
     """
     prepare_jax(not options.no_cache)
-    from capsule_id.report import columns, write
-
     try:
-        result = make_fit(rig, options, kinds or default_registry(), None, lambda *_: None)
+        return make_fit(rig, options, kinds or default_registry(), None, lambda *_: None)
     except KeyboardInterrupt:
         raise RuntimeError("interrupted") from None
-    changes = "".join(f"\n{line}" for line in columns.wrapped(result.remarks))
-    line = f"{rig.name}: {result.verdict}; report: {root / rig.name / 'report.html'}{changes}"
-    return write.result_files(result), line, result.clean
 
 
-def _on_cluster(
-    client: "Client", rigs: Sequence[Rig], options: Namespace, root: Path
-) -> Iterator[tuple[Rig, Callable[[], FittedRig]]]:
-    """Results as they arrive. The scheduler gives the rig of a worker that dies to another one."""
-    tasks = {client.submit(fitted_rig, rig, options, root, pure=False): rig for rig in rigs}
+def fitted_rig(rig: Rig, options: Namespace, root: Path, kinds: Registry | None = None) -> FittedRig:
+    """Fit one rig, which is written to ``root``/<rig name>."""
+    result = fit_by_worker(rig, options, kinds)
+    from capsule_id.report import columns, write
+
+    line = f"{rig.name}: {result.verdict}; report: {root / rig.name / 'report.html'}"
+    return write.result_files(result), "\n".join([line, *columns.wrapped(result.remarks)]), result.clean
+
+
+def each_result(
+    client: "Client | None", work: Callable[[Any], Any], items: Iterable[Any]
+) -> Iterator[tuple[Any, Callable[[], Any]]]:
+    """Each item with the function that returns what ``work`` makes of it: in turn, or from a cluster as they arrive.
+
+    The scheduler gives the item of a worker that dies to another one.
+    """
+    if client is None:
+        yield from ((item, partial(work, item)) for item in items)
+    tasks = {client.submit(work, item, pure=False): item for item in items} if client is not None else {}
     while tasks:
         # A wait for the next result would not notice an interruption.
         stop_if_interrupted()

@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.experiments.kind import default_registry
     from capsule_id.synthetic import ROBOT, Truth, synthesize, synthesize_robot
 
-    values, beside = dict(_assignment(text) for text in args.set), ""
+    values, beside = dict(assignment(text) for text in args.set), ""
     if args.robot and (unknown := sorted(set(values) - set(ROBOT))):
         raise InputError("--set takes a parameter of the robot", unknown[0], f"choose from {', '.join(ROBOT)}")
     with refusing("DIR must be writable", "name another one", args.directory):
@@ -45,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _assignment(text: str) -> tuple[str, float]:
+def assignment(text: str) -> tuple[str, float]:
+    """Name and value of ``NAME=VALUE``."""
     name, _, value = text.partition("=")
     try:
         return name, float(value)

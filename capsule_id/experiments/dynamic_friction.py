@@ -83,9 +83,11 @@ class PushSettings(SurfaceSettings):
     forward: Literal["closed", "capsule"] = "closed"
 
 
-def pushes(rng: np.random.Generator, mu: float, v_s: float, g: float) -> dict[str, np.ndarray]:
-    """Simulate a table of pushes at ``SPEEDS`` with their errors."""
-    surface = mu * (1.0 + SURFACE_SCATTER * rng.standard_normal(len(SPEEDS)))
+def pushes(
+    rng: np.random.Generator, mu: float, v_s: float, g: float, scatter: float = SURFACE_SCATTER
+) -> dict[str, np.ndarray]:
+    """Simulate a table of pushes at ``SPEEDS`` with their errors; ``scatter`` of mu is relative."""
+    surface = mu * (1.0 + scatter * rng.standard_normal(len(SPEEDS)))
     distance = slide_distance(unit_law(1.0, v_s), 1.0 / g, SPEEDS) / surface
     return {
         "speed [m/s]": SPEEDS + SPEED_SD * rng.standard_normal(len(SPEEDS)),
@@ -98,7 +100,15 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
         f'speed_sd = {{ value = {1e3 * SPEED_SD:g}, unit = "mm/s" }}',
         f'distance_sd = {{ value = {1e3 * DISTANCE_SD:g}, unit = "mm" }}',
     )
-    return Twin((TwinTable("dynamic_friction.csv", pushes(rng, values["mu"], values["v_s"], values["g"]), errors),))
+    return Twin(
+        (
+            TwinTable(
+                "dynamic_friction.csv",
+                pushes(rng, values["mu"], values["v_s"], values["g"], values.get("push_scatter", SURFACE_SCATTER)),
+                errors,
+            ),
+        )
+    )
 
 
 def _check_ground(entry: Entry[PushSettings]) -> None:

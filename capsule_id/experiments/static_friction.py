@@ -94,14 +94,14 @@ def _check_ground(entry: Entry[TiltSettings]) -> None:
         raise entry.error("N0", "normal_force holds N0 too", "both", "remove N0, or normal_force", of_key=True)
 
 
-def tilts(rng: np.random.Generator, mu: float, trials: int = TRIALS) -> dict[str, np.ndarray]:
-    """Simulate a table by the paper's protocol: ``trials`` tilts with scatter ``TRIAL_SD``."""
-    angle = np.arctan(mu) + TRIAL_SD * rng.standard_normal(trials)
+def tilts(rng: np.random.Generator, mu: float, trials: int = TRIALS, sd: float = TRIAL_SD) -> dict[str, np.ndarray]:
+    """Simulate a table by the paper's protocol: ``trials`` tilts with scatter ``sd``, rad."""
+    angle = np.arctan(mu) + sd * rng.standard_normal(trials)
     return {"angle [deg]": np.rad2deg(angle)}
 
 
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
-    return Twin((TwinTable("static_friction.csv", tilts(rng, values["mu"])),))
+    return Twin((TwinTable("static_friction.csv", tilts(rng, values["mu"], sd=values.get("tilt_sd", TRIAL_SD))),))
 
 
 TEMPLATE = """\
