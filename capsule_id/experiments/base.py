@@ -171,8 +171,6 @@ class Experiment(eqx.Module):
     balanced: ClassVar[tuple[str, ...]] = ()
     #: Names of the parameters whose sign is unknown: the point fit tries both.
     mirrored: ClassVar[tuple[str, ...]] = ()
-    #: Whether the motion of a record grows as its release does.
-    proportional: ClassVar[bool] = False
     #: Symbols of the masses that the likelihood reads.
     masses: ClassVar[tuple[str, ...]] = ()
     #: Time of every reading of a channel in periods of the motion, (n,); None without a period.

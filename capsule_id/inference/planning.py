@@ -20,6 +20,7 @@ from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import CapsuleRun
+from capsule_id.experiments.free_vibration.record import DecayRecord
 from capsule_id.experiments.kind import Kind, Registry, make_experiments
 from capsule_id.experiments.point_test import PointTest
 from capsule_id.inference.curvature import jacobian
@@ -44,7 +45,7 @@ MOST_ROWS = 60
 #: Settings of a further test in parts of the smallest and the largest measured one; amplitudes in parts of the record's.
 BEYOND, AMPLITUDES = (0.5, 1.5), (0.5, 1.0, 2.0)
 #: Drive, frequency and gap of a further run in parts of those of a recorded one.
-DRIVES, FREQUENCIES, GAPS = (0.7, 1.0, 1.4), (0.8, 1.0, 1.25), (0.5, 1.0, 2.0)
+DRIVES, FREQUENCIES, GAPS = (0.7, 1.0, 1.4), (0.8, 1.0, 1.25), (0.5, 2.0)
 #: Least mean decrease of the logarithm of an sd with which tests share the time with others.
 LEAST = 0.01
 #: Largest part of the information by which its differences with steps of 1 and 2 may differ: the motion changes its kind.
@@ -191,11 +192,9 @@ def _designs(e: PointTest, kind: Kind) -> Iterator[tuple[str, Mapping[str, np.nd
 
     low, high = (float(column.values[i]) for i in order[[0, -1]])
     yield words(low, high), {}, order[[0, -1]]
-    for value, row in ((low, order[:1]), (high, order[-1:])):
-        yield words(value), {}, row
-    if kind.set_by == column.name:
-        for part, value, row in ((BEYOND[0], low, order[:1]), (BEYOND[1], high, order[-1:])):
-            yield words(part * value), {column.name: part * column.values}, row
+    for below, above in ((1.0, 1.0), BEYOND) if kind.set_by == column.name else ((1.0, 1.0),):
+        yield words(below * low), {column.name: below * column.values}, order[:1]
+        yield words(above * high), {column.name: above * column.values}, order[-1:]
 
 
 def _runs(e: CapsuleRun) -> Iterator[tuple[str, Experiment, Values]]:
@@ -204,9 +203,8 @@ def _runs(e: CapsuleRun) -> Iterator[tuple[str, Experiment, Values]]:
     if settings.drive != "harmonic":
         yield "", e, {}
         return
-    for drive, rate, gap in product(DRIVES, FREQUENCIES, GAPS):
-        if (gap != 1.0 and (drive, rate) != (1.0, 1.0)) or (gap != 1.0 and settings.gap is None):
-            continue
+    gaps = [] if settings.gap is None else [(1.0, 1.0, gap) for gap in GAPS]
+    for drive, rate, gap in (*product(DRIVES, FREQUENCIES, (1.0,)), *gaps):
         own = {"start": "settled", "Omega": rate * e.Omega, "f": None}
         own |= {} if settings.gap is None else {"gap": Quantity(gap * settings.gap.value, settings.gap.sd)}
         own |= {} if settings.P_d is None else {"P_d": Quantity(drive * settings.P_d.value, drive * settings.P_d.sd)}
@@ -248,7 +246,7 @@ def candidates(
             ]
         else:
             strength = number if e.time_series else number / e.n
-            for part in AMPLITUDES if e.proportional else (1.0,):
+            for part in AMPLITUDES if isinstance(e, DecayRecord) and not e.model.symbols else (1.0,):
                 words = f"as {e.label}" + (f", {part:g} x its amplitude" if part != 1.0 else "")
                 found.append(Candidate(e, words, *about, strength * part**2, starts, {}))
     return found, left_out
@@ -277,27 +275,26 @@ def twins(known: Values, rig: Rig, kinds: Sequence[Kind], registry: Registry, se
 
 def lines_of(e: Experiment, kind: Kind) -> str:
     """The entry of rig.toml that reads tests like ``e``: its settings and reading errors, in SI units."""
-    settings, columns = e.table.settings, e.table.columns.values()
+    columns, own = e.table.columns.values(), fields(e.table.settings)
+    stated = {one.name: (one.default, getattr(e.table.settings, one.name)) for one in own}
     shown = {"kind": json.dumps(kind.name), "file": json.dumps(f"{kind.name}_next.csv")}
-    for one in fields(settings):
-        value, rule = getattr(settings, one.name), kind.setting_rules[one.name]
-        if value == one.default or value is None:
-            continue
-        if isinstance(rule, QuantityRule):
-            shown[one.name] = _quantity(value if isinstance(value, Quantity) else Quantity(value), rule.si)
-        else:
-            shown[one.name] = json.dumps(value)
+    shown |= {
+        key: _text(x, kind.setting_rules[key]) for key, (default, x) in stated.items() if x not in (default, None)
+    }
     for column in columns:
-        stated = {"sd": column.sd, "resolution": column.resolution}
-        unit = "s" if column.name == "time" else kind.columns[column.name].si
-        shown |= {f"{column.name}_{key}": _quantity(Quantity(x), unit) for key, x in stated.items() if x is not None}
+        rule = QuantityRule("s" if column.name == "time" else kind.columns[column.name].si)
+        errors = {"sd": column.sd, "resolution": column.resolution}
+        shown |= {f"{column.name}_{key}": _text(x, rule) for key, x in errors.items() if x is not None}
     header = ", ".join(f"{column.name} [{column.unit}]" for column in columns)
     return "\n".join(["[[experiment]]", *(f"{key} = {text}" for key, text in shown.items()), f"# columns: {header}"])
 
 
-def _quantity(quantity: Quantity, unit: str) -> str:
-    error = f", sd = {quantity.sd:.6g}" if quantity.sd else ""
-    return f'{{ value = {quantity.value:.6g}{error}, unit = "{unit}" }}'
+def _text(value: Any, rule: object) -> str:
+    """A setting as TOML; a quantity in its SI unit."""
+    if not isinstance(rule, QuantityRule):
+        return json.dumps(value)
+    own = value if isinstance(value, Quantity) else Quantity(value)
+    return f'{{ value = {own.value:.6g}{f", sd = {own.sd:.6g}" if own.sd else ""}, unit = "{rule.si}" }}'
 
 
 def next_tests(
@@ -435,11 +432,9 @@ def planned(folder: str | Path, registry: Registry, draws: int = DRAWS, seed: in
     place, tests = rig.folder / "rig.toml", rig.plan.get("tests", {})
     by_word = {kind.test or kind.name: kind for kind in registry.kinds}
     known = [word for word, kind in by_word.items() if kind.bench and kind.twin]
-    for word in tests:
-        if word not in known:
-            raise InputError(
-                "[plan] tests can be planned for bench tests", word, f"choose from {', '.join(known)}", place
-            )
+    if unknown := [word for word in tests if word not in known]:
+        remedy = f"choose from {', '.join(known)}"
+        raise InputError("[plan] tests can be planned for bench tests", unknown[0], remedy, place)
     if not tests or rig.m1 is None or rig.m2 is None:
         rule = "a plan needs m1 and m2 in [rig], and tests in [plan]"
         raise InputError(rule, "not all of them", "write [plan] tests = { push = 10, free_vibration = 3 }", place)

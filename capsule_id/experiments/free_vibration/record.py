@@ -391,10 +391,6 @@ class DecayRecord(Decay):
         self.clock_rate = stated_rate(table)
         self.about = replace(self.about, parameters=(*self._rows(), *clock_parameters(table, rig)))
 
-    @property
-    def proportional(self) -> bool:  # type: ignore[override]  # pyright: ignore
-        return not self.model.symbols
-
     def _rows(self) -> list[Parameter]:
         """Its parameters, without the drift of its clock.
 
