@@ -12,15 +12,26 @@ from typing import cast
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments.base import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.hidden_terms import Hidden, check_hidden_terms, force_responses, hidden_terms
+from capsule_id.experiments.free_vibration.hidden_terms import (
+    Hidden,
+    changing_motions,
+    check_changing,
+    check_hidden_terms,
+    force_responses,
+    hidden_terms,
+    left_by,
+)
 from capsule_id.experiments.free_vibration.lint import MESSAGES
+from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.record import Screened
+from capsule_id.experiments.free_vibration.screening import Screening
 from capsule_id.experiments.free_vibration.second_fit import open_models, second_models
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.experiments.statistics import further_columns
@@ -278,3 +289,97 @@ def test_a_fit_far_off_shows_no_force() -> None:
     responses = force_responses(record, {**VISCOUS, "k1": 1e24, "c": 0.0, noise: NOISE})
     assert [np.any(response) for response in responses.values()] == [False] * 3
     assert np.any(force_responses(record, {**VISCOUS, noise: NOISE})["F_dry"])
+
+
+#: s, N s/m in the middle of it, and N: the motion falls by a factor of 300.
+CHANGE_TIME, C_MIDDLE, RUBBING = np.linspace(0.0, 0.32, 400), 3.9, 5e-3
+
+
+def growing(growth: float, release: float = RELEASE, time: np.ndarray = CHANGE_TIME) -> np.ndarray:
+    """(3, n) x_rel, its rate and its acceleration by SciPy, of a c that grows linearly by ``growth`` of its mean."""
+
+    def rates(t: float | np.ndarray, s: np.ndarray) -> list[np.ndarray]:
+        c = C_MIDDLE * (1.0 + growth * (t / CHANGE_TIME[-1] - 0.5))
+        return [s[1], -(c * s[1] + bench.K1 * s[0]) / bench.M1]
+
+    state = solve_ivp(rates, (0.0, time[-1]), [release, 0.0], t_eval=time, rtol=1e-11, atol=1e-16, method="DOP853").y
+    return np.stack([*state, rates(time, state)[1]])
+
+
+@pytest.mark.parametrize("growth", [-0.4, 0.4])
+def test_the_motion_of_a_c_that_changes_is_that_by_scipy(growth: float) -> None:
+    theta = {"k1": bench.K1, "m1": bench.M1, "c": C_MIDDLE}
+    parts = None
+    for order, expected in enumerate(growing(growth)):
+        columns = changing_motions(CHANGE_TIME, theta, growth, CHANGE_TIME[-1], order)
+        parts = np.linalg.lstsq(columns, expected)[0] if parts is None else parts
+        np.testing.assert_allclose(columns @ parts, expected, rtol=0.0, atol=1e-5 * np.ptp(expected))
+
+
+def changing_findings(
+    *motions: np.ndarray, noise: float, words: tuple[str, ...], seed: int = 0, **settings: object
+) -> list[Finding]:
+    """The findings on a c that changes, of records with white noise, at their joint fit with these forces."""
+    tables = []
+    for i, x in enumerate(motions):
+        x = x + noise * np.random.default_rng(seed + i).standard_normal(len(x))
+        columns = [bench.column("time", CHANGE_TIME), bench.column("x_rel", x)]
+        tables.append(bench.table("free_vibration", columns, f"decay_{i}", **settings))
+    made = cast(list[FreeVibration], make_experiments(bench.rig(*tables)))
+    records = [e.with_model(DecayModel(words)) for e in made]
+    near = {"k1": bench.K1, "c": C_MIDDLE, "F_dry": RUBBING}
+    fits = [(each := Screening(e)).fit(e.model, each.scaled(near))[0] for e in records]
+    values = {name: fits[-1].values[name] for name in ("m1", "k1", "c", *records[0].model.symbols)}
+    for e, own in zip(records, fits, strict=True):
+        values |= {row.name: own.values.get(row.symbol, own.noise) for row in e.parameters if row.name not in values}
+    moved = [name for name in values if name != "m1" and not name.startswith("noise")]
+    scale = np.array([1e-3 if name.startswith("turning") else values[name] for name in moved])
+
+    def joint(z: np.ndarray) -> dict[str, float]:
+        return {**values, **dict(zip(moved, [values[name] for name in moved] + z * scale, strict=True))}
+
+    def left(z: np.ndarray) -> np.ndarray:
+        return np.concatenate([left_by(e, e.local(joint(z))) for e in records]) / noise
+
+    values = joint(least_squares(left, np.zeros(len(moved)), diff_step=1e-5, x_scale="jac").x)
+    return check_changing(records, SimpleNamespace(values=values))  # type: ignore[arg-type]  # pyright: ignore
+
+
+def rubbed(release: float) -> np.ndarray:
+    """x_rel of a decay with dry friction by SciPy."""
+    return scipy_decay(CHANGE_TIME, {"k1": bench.K1, "m1": bench.M1, "c": C_MIDDLE, "F_dry": RUBBING}, release, 0.0)[0]
+
+
+def test_dry_friction_that_a_change_of_c_explains_as_well_is_not_judged() -> None:
+    """Before: dry friction of 2.2 ± 0.25 mN and c = 3.83 ± 0.01 trusted, of a rig without it whose c grew to 4.6."""
+    (finding,) = changing_findings(growing(0.3)[0], noise=4e-5, words=("dry",))
+    assert (finding.level, finding.parameters, finding.facts["decided"]) == ("warn", ("c", "F_dry"), False)
+    text = MESSAGES[finding.code].text(finding.level, finding.facts)
+    assert "tell dry friction from a c that changes with time; they do not" in text
+    assert finding.facts["c"] == pytest.approx(C_MIDDLE, rel=0.05)
+    # The words that the text names count as known.
+    line = cast("re.Match[str]", re.search(r"write (damping = \[.*?\])", text))[1]
+    stated = tuple(tomllib.loads(line)["damping"])
+    assert changing_findings(growing(0.3)[0], noise=4e-5, words=("dry",), damping=stated) == []
+
+
+def test_another_amplitude_tells_dry_friction_from_a_change_of_c() -> None:
+    (finding,) = changing_findings(rubbed(RELEASE), noise=2e-5, words=("dry",), seed=3)
+    assert "Add records of 3 times this amplitude" in MESSAGES[finding.code].text(finding.level, finding.facts)
+    assert changing_findings(rubbed(RELEASE), rubbed(3.0 * RELEASE), noise=2e-5, words=("dry",), seed=3) == []
+    # Of a rig whose c changes they tell that, and stated words do not hide it.
+    both = growing(0.3)[0], growing(0.3, 3.0 * RELEASE)[0]
+    (named,) = changing_findings(*both, noise=2e-5, words=("dry",), damping=("viscous", "dry"))
+    assert (named.facts["decided"], named.parameters) == (True, ("c", "F_dry"))
+    assert named.facts["growth"] == pytest.approx(0.3, abs=3.0 * named.facts["error"])
+    assert "c changes with time" in MESSAGES[named.code].text(named.level, named.facts)
+
+
+def test_a_viscous_decay_shows_a_change_of_c_where_there_is_one() -> None:
+    """Negative control: none of ten decays of constant c does."""
+    for growth in (-0.2, 0.2):
+        (finding,) = changing_findings(growing(growth)[0], noise=2e-5, words=())
+        assert finding.parameters == ("c",)
+        assert finding.facts["growth"] == pytest.approx(growth, abs=3.0 * finding.facts["error"])
+    for seed in range(10):
+        assert changing_findings(growing(0.0)[0], noise=2e-5, words=(), seed=seed) == []

@@ -13,6 +13,7 @@ from capsule_id.experiments.base import LEVEL, Check, Fitted, ValuesBySymbol, re
 from capsule_id.experiments.free_vibration.decrement import equilibrium, viscous_fit
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
+    check_changing,
     check_held,
     check_hidden_terms,
     sensitivities,
@@ -420,6 +421,7 @@ class FreeVibration(DecayRecord):
         check_drift,
         check_zero,
         check_hidden_terms,
+        check_changing,
         check_held,
     )
     tables = (decay_table, damping_table)

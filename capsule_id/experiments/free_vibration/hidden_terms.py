@@ -1,24 +1,26 @@
-"""What the fitted model of a decay lacks: further forces, a hold before the release, jumps of the zero of a sensor."""
+"""What the fitted model of a decay lacks: further forces, a c that changes, a hold before the release, jumps of the zero."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 from scipy.optimize import least_squares
 from scipy.signal import lsim
 
-from capsule_id.experiments.base import Fitted, ValuesBySymbol, refit, stretch
+from capsule_id.experiments.base import LEVEL, Fitted, ValuesBySymbol, refit, stretch
 from capsule_id.experiments.free_vibration.decrement import PEAKLESS, STRONGEST, UNKNOWNS, viscous_fit, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FURTHER,
+    block_mean,
     block_size,
     decay_window,
     natural_units,
 )
-from capsule_id.experiments.free_vibration.record import Decay, DecayRecord
+from capsule_id.experiments.free_vibration.record import FINEST, Decay, DecayRecord
+from capsule_id.experiments.friction_variants import DOUBTFUL, FACTOR
 from capsule_id.experiments.statistics import without
 from capsule_id.parameters import QUANTILE_975, parameter
 from capsule_id.records.release import EVIDENCE
@@ -265,9 +267,7 @@ def hidden_terms(records: Sequence[Decay], values: Mapping[str, float]) -> dict[
     known, further, left = (np.concatenate(part) for part in zip(*blocks, strict=True))
     model = records[0].model
     names = ("k1", "c", *model.symbols)
-    size = np.linalg.norm(known, axis=0)
-    size = np.where(size > 0.0, size, 1.0)
-    inverse = np.linalg.pinv(known / size) / size[:, None]
+    inverse = inverse_of(known)
     errors = dict(zip(names, np.linalg.norm(inverse, axis=1), strict=True))
     found = {}
     for symbol, column in zip(model.absent, further.T, strict=True):
@@ -281,16 +281,24 @@ def hidden_terms(records: Sequence[Decay], values: Mapping[str, float]) -> dict[
     return found
 
 
-def reduced(e: Decay, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def inverse_of(known: np.ndarray) -> np.ndarray:
+    """Pseudo-inverse (p, n) of derivatives (n, p) in units of the noise; the lengths of its rows are standard errors."""
+    size = np.linalg.norm(known, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    return np.linalg.pinv(known / size) / size[:, None]
+
+
+def reduced(e: Decay, theta: Mapping[str, float], beside: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives (n, p) and (n, q), and residuals (n,), in units of the noise, without the nuisances of ``e`` alone.
 
-    Derivatives with respect to k1, c and ``model.symbols``, and to the forces that the model lacks.
+    Derivatives with respect to k1, c and ``model.symbols``, and, unless ``beside`` is false, to the forces that the model
+    lacks.
     """
     left, design, moved = sensitivities(e, theta)
-    further = further_sensitivities(e, theta)
+    further = further_sensitivities(e, theta) if beside else {}
     shared = np.column_stack([moved.pop(name) for name in ("k1", "c", *e.model.symbols)])
     own = e.whitened(theta, np.column_stack([design, *moved.values()]))
-    absent = np.column_stack([further[s] for s in e.model.absent])
+    absent = np.column_stack([left[:, None][:, :0], *(further[s] for s in e.model.absent if beside)])
     parts = [e.whitened(theta, part) for part in (shared, absent, left[:, None])]
     known, others, residuals = without(own, *parts)
     # The offset takes up dry friction in a decay that does not swing: only rounding is left of it.
@@ -298,6 +306,117 @@ def reduced(e: Decay, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarra
     misfit = residuals - known @ np.linalg.lstsq(known, residuals, rcond=None)[0]
     noise = np.sqrt(np.sum(misfit**2) / max(e.n - own.shape[1] - known.shape[1], 1))
     return known / noise, others / noise, residuals[:, 0] / noise
+
+
+# changing damping: A c that changes linearly with time, as of a damper that warms up.
+#
+# A c that grows damps small motions more than large ones, as dry friction does; one that falls, as quadratic damping
+# does. The comparison is by BIC at the maxima of both models.
+
+
+#: Smallest omega^2 of a decay whose c changes, relative to k1/m1: its frequency stays real.
+SMALLEST_SQUARE = 0.01
+#: Points of the Gauss rule for the phase: exact up to rounding for a c that grows by 40 %, up to a damping ratio of 0.5.
+PHASE_POINTS = 12
+#: Bounds of the logarithms of k1 and c from their fitted values, and of the growth of c relative to its value in the middle.
+WIDEST_CHANGE = (0.1, 1.0, 1.9)
+
+
+def changing_motions(
+    time: np.ndarray, theta: Mapping[str, float], growth: float, length: float, order: int
+) -> np.ndarray:
+    """(n, 2) decays, or their derivatives of this ``order``, whose c grows by ``growth`` times ``theta["c"]`` in ``length`` s.
+
+    c is reached at half that time. With x = exp(-int gamma) y, y'' + (omega_0^2 - gamma^2 - gamma') y = 0 has no damping.
+    Its frequency changes slowly, so y is its phase's cosine and sine over the root of the frequency (Liouville and Green).
+    """
+    middle, square = theta["c"] / (2.0 * theta["m1"]), theta["k1"] / theta["m1"]
+    rate = middle * growth / length
+    points, weights = np.polynomial.legendre.leggauss(PHASE_POINTS)
+
+    def gamma(t: np.ndarray) -> np.ndarray:
+        return middle + rate * (t - 0.5 * length)
+
+    def omega(t: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(square - gamma(t) ** 2 - rate, SMALLEST_SQUARE * square))
+
+    own, phase = omega(time), 0.5 * time * (omega(0.5 * time[:, None] * (1.0 + points)) @ weights)
+    x = np.exp(-time * gamma(0.5 * time) + 1j * phase) / np.sqrt(own)
+    velocity = x * (-gamma(time) + 1j * own + 0.5 * gamma(time) * rate / own**2)
+    found = (x, velocity, -2.0 * gamma(time) * velocity - square * x)[order]
+    return np.stack([found.real, found.imag], axis=1)
+
+
+def left_by(e: DecayRecord, theta: Mapping[str, float], growth: float | None = None) -> np.ndarray:
+    """Whitened residuals (n,) beside the linear nuisances; of viscous damping that grows, where ``growth`` is stated."""
+    raw, design = e.unwhitened(theta, np)
+    if growth is not None:
+        nodes = np.ravel(e.nodes) * stretch(e.clock_rate, theta)
+        motions = changing_motions(nodes, theta, growth, float(e.time[-1]), e.order)
+        raw, design = e.values, np.column_stack([block_mean(motions, e.weights, np), design[:, 2 * e.closed :]])
+    return without(e.whitened(theta, design), e.whitened(theta, raw))[0]
+
+
+def check_changing(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
+    """Check that c does not change with time where that explains the decays about as well as their model, or better.
+
+    Stated damping counts as known, until c that changes is ``FACTOR`` times as probable.
+    """
+    groups, findings = dict[Any, list[DecayRecord]](), list[Finding]()
+    for e in records:
+        if fit.values["c"] < 2.0 * STRONGEST * np.sqrt(fit.values["k1"] * e.mass):
+            groups.setdefault((e.model.symbols, e.table.settings.damping), []).append(e)
+    for (symbols, stated), members in groups.items():
+        facts = changing(members, fit.values)
+        decided = facts["factor"] > FACTOR
+        # A viscous decay is the case without growth: chance alone often gives a little.
+        shown = bool(symbols) or facts["p"] < LEVEL
+        if facts["shift"] > DOUBTFUL and (decided or (shown and stated is None)):
+            facts |= {
+                "decided": decided,
+                "limit": FACTOR,
+                "symbols": symbols,
+                "damping": members[0].model.lines("damping"),
+            }
+            labels = [e.label for e in members]
+            findings.append(Finding("decays.changing", "warn", {**facts, "labels": labels}, labels[0], ("c", *symbols)))
+    return findings
+
+
+def changing(members: Sequence[DecayRecord], values: Mapping[str, float]) -> dict[str, Any]:
+    """Compare the quoted model with viscous damping whose c changes with time, for records of one model."""
+    thetas = [e.local(values) for e in members]
+    rms = [float(np.sqrt(np.mean(left_by(e, theta) ** 2))) for e, theta in zip(members, thetas, strict=True)]
+    # Rounding errors of records without noise decide nothing.
+    least = FINEST * np.array([e.width for e in members])
+    noise = np.maximum(rms, least)
+
+    def left(z: np.ndarray) -> np.ndarray:
+        moved = {"k1": values["k1"] * np.exp(z[0]), "c": values["c"] * np.exp(z[1])}
+        parts = zip(members, thetas, noise, strict=True)
+        return np.concatenate([left_by(e, {**theta, **moved}, z[2]) / sd for e, theta, sd in parts])
+
+    widest = np.array(WIDEST_CHANGE)
+    found = least_squares(left, np.zeros(3), bounds=(-widest, widest), x_scale="jac")
+    ends = np.cumsum([e.n for e in members])
+    parts = zip(np.split(found.fun, ends[:-1]), least / noise, strict=True)
+    gain = -sum(len(part) * np.log(max(np.mean(part**2), share**2)) for part, share in parts)
+    symbols, rig = members[0].model.symbols, members[0].rig
+    weight = special.expit(0.5 * (gain + (len(symbols) - 1) * np.log(ends[-1])))
+    known = np.concatenate([reduced(e, theta, beside=False)[0] for e, theta in zip(members, thetas, strict=True)])
+    relative = 0.0 if rig.m1 is None else rig.m1.sd / rig.m1.value
+    sd = np.hypot(np.linalg.norm(inverse_of(known)[1]), values["c"] * relative)
+    c = float(values["c"] * np.exp(found.x[1]))
+    return {
+        "growth": float(found.x[2]),
+        "error": float(np.linalg.norm(inverse_of(found.jac)[2])),
+        "c": c,
+        "value": values["c"],
+        "model": members[0].model.name,
+        "factor": float(weight / max(1.0 - weight, np.finfo(float).tiny)),
+        "p": float(stats.chi2.sf(gain, 1)),
+        "shift": float(weight * abs(c - values["c"]) / sd),
+    }
 
 
 # held: A hold that may be left in front of the release.

@@ -47,7 +47,7 @@ from capsule_id.rig.filters import loudest_part, median_step, uneven_sampling
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.rig.units import factor_to_si
-from capsule_id.views import Facts, Finding, Level, Message, filled_in
+from capsule_id.views import Facts, Finding, Level, Message, filled_in, listed
 
 # lint: Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any
 # record.
@@ -525,6 +525,28 @@ def _hidden(facts: Facts) -> str:
     )
 
 
+def _changing(facts: Facts) -> str:
+    """How c would change with time, how probable that is, and remedies."""
+    names = f"{' and '.join(('c', *facts['symbols']))} {'are' if facts['symbols'] else 'is'}"
+    factor = f"more than {facts['limit']:.0f}" if facts["decided"] else f"{facts['factor']:.2g}"
+    found = (
+        f"A c that {'grows' if facts['growth'] > 0.0 else 'falls'} by {100.0 * abs(facts['growth']):.0f} ± "
+        f"{100.0 * facts['error']:.1f} % within the record is {factor} times as probable as {facts['model']}. c is then "
+        f"{facts['c']:.4g} N s/m in the middle of the record (the fit: {facts['value']:.4g}), so {names} not judged."
+    )
+    if facts["decided"]:
+        return (
+            f"{listed(facts['labels'])}: c changes with time, as of a damper that warms up. {found} No fit corrects it. Let "
+            "the rig reach a steady temperature, and record again."
+        )
+    effects = " or ".join(EFFECTS[symbol] for symbol in facts["symbols"]) or "a constant c"
+    return (
+        f"{listed(facts['labels'])}: expected records that tell {effects} from a c that changes with time; they do not. "
+        f"{found} Add records of 3 times this amplitude: a force changes its effect with the amplitude, a change with time "
+        f"does not. Where another measurement excludes a change with time, write {facts['damping']} in the experiment."
+    )
+
+
 _HELD = (
     "{label}: the readings do not tell the release from one up to a quarter of a period later. {name} then lies between "
     "{low:.3g} and {high:.3g} {unit} (the fit: {value:.3g})."
@@ -541,6 +563,7 @@ MESSAGES = {
         warn=_hidden,
         fail=_hidden,
     ),
+    "decays.changing": Message("damping against time", on_console=True, warn=_changing),
     "decays.held": Message(
         "release of a decay",
         ok="{labels}: k1 and c do not depend on the instant of the release",
