@@ -9,9 +9,6 @@ from capsule_id.errors import check_seed
 from capsule_id.parameters import is_stated
 from capsule_id.views import counted
 
-#: Smallest correlation with another parameter that is printed.
-LEAST = 0.5
-
 OPTIONS = {
     "": (
         ("data", "DATA", "rig folder with [plan] tests (default: the working folder)", {"nargs": "?", "default": "."}),
@@ -36,9 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.inference.planning import planned
 
     frame, minutes = planned(args.data, default_registry(), draws, args.seed)
-    tied = frame["correlation"].abs() >= LEAST
-    frame = frame.assign(**{"correlation": frame["correlation"].where(tied), "with": frame["with"].where(tied, "")})
-    own = frame[[not is_stated(str(name)) for name in frame.index]].rename_axis(None)
+    own = frame.round({"correlation": 2})[[not is_stated(str(name)) for name in frame.index]].rename_axis(None)
     say(own.to_string(float_format="%.2g", na_rep=""))
     say(f"{minutes:g} min of tests; sd / value: expected, in the mean over {counted(draws, 'draw')} of the priors")
     return 0

@@ -179,6 +179,14 @@ def _remade(e: PointTest, changed: Mapping[str, np.ndarray], rows: np.ndarray) -
     return type(e).make(table, e.rig, e.friction)[0]  # type: ignore[return-value]  # pyright: ignore
 
 
+def _repeated(
+    e: PointTest, number: float, rows: np.ndarray, changed: Mapping[str, np.ndarray]
+) -> tuple[Experiment, float]:
+    """The test with so many trials, at most ``MOST_ROWS``, that repeat ``rows``; also the trials that each stands for."""
+    chosen = np.resize(rows, max(int(min(number, MOST_ROWS)), len(rows)))
+    return _remade(e, changed, chosen), number / len(chosen)
+
+
 def _designs(e: PointTest, kind: Kind) -> Iterator[tuple[str, Mapping[str, np.ndarray], np.ndarray]]:
     """Which rows of its table, and with what settings, further trials may have: words, changed columns, rows."""
     yield "", {}, np.arange(e.n)
@@ -205,9 +213,9 @@ def _runs(e: CapsuleRun) -> Iterator[tuple[str, Experiment, Values]]:
         return
     gaps = [] if settings.gap is None else [(1.0, 1.0, gap) for gap in GAPS]
     for drive, rate, gap in (*product(DRIVES, FREQUENCIES, (1.0,)), *gaps):
-        own = {"start": "settled", "Omega": rate * e.Omega, "f": None}
-        own |= {} if settings.gap is None else {"gap": Quantity(gap * settings.gap.value, settings.gap.sd)}
-        own |= {} if settings.P_d is None else {"P_d": Quantity(drive * settings.P_d.value, drive * settings.P_d.sd)}
+        own: dict[str, Any] = {"start": "settled", "Omega": rate * e.Omega, "f": None}
+        own["gap"] = settings.gap and Quantity(gap * settings.gap.value, settings.gap.sd)
+        own["P_d"] = settings.P_d and Quantity(drive * settings.P_d.value, drive * settings.P_d.sd)
         parts = {"x its drive": drive, "x its frequency": rate, "x its gap": gap}
         words = "".join(f", {x:g} {word}" for word, x in parts.items() if x != 1.0)
         changed = {"I_d": drive, "P_d": drive, "G": gap}
@@ -237,8 +245,7 @@ def candidates(
         about = (number, number * each)
         if isinstance(e, PointTest):
             for words, changed, rows in _designs(e, kind):
-                chosen = np.resize(rows, max(min(number, MOST_ROWS), len(rows)))
-                template, strength = _remade(e, changed, chosen), number / len(chosen)
+                template, strength = _repeated(e, number, rows, changed)
                 found.append(Candidate(template, f"as {e.label}{words}", *about, strength, starts, {}))
         elif isinstance(e, CapsuleRun):
             found += [
@@ -449,15 +456,10 @@ def planned(folder: str | Path, registry: Registry, draws: int = DRAWS, seed: in
         values = {name: start.centre for name, start in target.starts().items()}
         for e in made:
             number = tests[registry[e.kind].test or e.kind]
-            chosen = (
-                np.resize(np.arange(e.n), max(int(min(number, MOST_ROWS)), e.n)) if isinstance(e, PointTest) else None
-            )
-            template = e if chosen is None else _remade(e, {}, chosen)  # type: ignore[arg-type]  # pyright: ignore
-            alike = 1 if chosen is not None else sum(other.kind == e.kind for other in made)
-            strength = number / (alike if chosen is None else len(chosen))
-            precision = (
-                precision + Candidate(template, "", 1, 1.0, strength, values, {}).information([values], names)[0]
-            )
+            part = e, number / sum(other.kind == e.kind for other in made)
+            template, strength = _repeated(e, number, np.arange(e.n), {}) if isinstance(e, PointTest) else part
+            own = Candidate(template, "", 1, 1.0, strength, values, {})
+            precision = precision + own.information([values], names)[0]
         covariances.append(np.linalg.inv(precision))
     sds, prior = np.sqrt([np.diag(each) for each in covariances]), np.array([prior_sd(row) for row in rows])
     frame = words_of([row.name for row in rows], np.mean(covariances, axis=0), np.mean(sds, axis=0) / prior)
