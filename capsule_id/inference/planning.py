@@ -13,6 +13,7 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 import pandas as pd
 
@@ -22,7 +23,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import CapsuleRun
 from capsule_id.experiments.free_vibration.record import DecayRecord
 from capsule_id.experiments.kind import Kind, Registry, make_experiments
-from capsule_id.experiments.point_test import PointTest
+from capsule_id.experiments.point_test import Line, PointTest
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.pipeline import check_readings, second_models
@@ -176,7 +177,9 @@ def _remade(e: PointTest, changed: Mapping[str, np.ndarray], rows: np.ndarray) -
     """The test with ``rows`` of its table and with other values of some columns."""
     columns = {name: replace(c, values=changed.get(name, c.values)[rows]) for name, c in e.table.columns.items()}
     table = replace(e.table, columns=columns, rows=np.arange(1, len(rows) + 1))
-    return type(e).make(table, e.rig, e.friction)[0]  # type: ignore[return-value]  # pyright: ignore
+    made: Any = type(e).make(table, e.rig, e.friction)[0]
+    # The prior of an intercept is as wide as the range of the measured readings, which a single level does not have.
+    return eqx.tree_at(lambda line: line.width, made, e.width) if isinstance(e, Line) else made
 
 
 def _repeated(

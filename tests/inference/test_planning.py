@@ -110,6 +110,14 @@ def test_the_best_test_is_one_that_reads_the_target(rig: Rig) -> None:
     assert next_tests(result, ["K"], minutes=20).table.iloc[0]["K, ratio"] < plan.table.iloc[0]["K, ratio"]
 
 
+def test_one_level_tells_nothing_of_a_slope_beside_a_free_intercept(rig: Rig) -> None:
+    plan = next_tests(result_of(rig), ["K"], minutes=10)
+    alone = plan.table[plan.table["what"].str.fullmatch(r"as motor_current, current [\d.]+ A")]
+    assert len(alone) == 2
+    assert alone["K, ratio"].min() > 0.98
+    assert plan.table.iloc[0]["what"] == "as motor_current, current 0.25 and 2 A"
+
+
 def test_kinds_share_the_time_where_both_help(rig: Rig) -> None:
     plan = next_tests(result_of(rig), ["c", "v_s"], minutes=30)
     assert " + " in plan.table.iloc[0]["kind"]
