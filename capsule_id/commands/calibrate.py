@@ -72,7 +72,7 @@ def run(args: Namespace) -> int:
             if not any(args.directory.iterdir()):
                 replace_file(file, f"{json.dumps(study)}\n")
             before, *lines = map(json.loads, file.read_text(encoding="utf-8").splitlines())
-            outcomes = {line["rig"]: line for line in lines}
+            before, outcomes = dict(before), {line["rig"]: line for line in lines if "ranks" in line}
         if changed := [f"{name} was {before.get(name)}" for name in study if before.get(name) != study[name]]:
             raise InputError(
                 "a begun study continues with the same options and versions",

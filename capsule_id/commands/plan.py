@@ -33,6 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.inference.planning import planned
 
     frame, minutes = planned(args.data, default_registry(), draws, args.seed)
+    frame["with"] = frame["with"].where(frame["correlation"].abs() >= 0.5, "")
     own = frame.round({"correlation": 2})[[not is_stated(str(name)) for name in frame.index]].rename_axis(None)
     say(own.to_string(float_format="%.2g", na_rep=""))
     say(f"{minutes:g} min of tests; sd / value: expected, in the mean over {counted(draws, 'draw')} of the priors")

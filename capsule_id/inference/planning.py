@@ -34,8 +34,9 @@ from capsule_id.inference.target import LogPosterior, prior_sd
 from capsule_id.parameters import QUANTILE_975, by_index, is_stated, symbol_of
 from capsule_id.rig.model import Quantity, Rig
 from capsule_id.rig.read import read_rig
-from capsule_id.rig.schema import QuantityRule
+from capsule_id.rig.schema import GroundSettings, QuantityRule
 from capsule_id.synthetic import PAPER, Truth, synthesize
+from capsule_id.views import counted
 
 #: Draws at which the information is computed, and the time for the tests, min.
 DRAWS, MINUTES = 8, 30.0
@@ -47,6 +48,8 @@ MOST_ROWS = 60
 BEYOND, AMPLITUDES = (0.5, 1.5), (0.5, 1.0, 2.0)
 #: Drive, frequency and gap of a further run in parts of those of a recorded one.
 DRIVES, FREQUENCIES, GAPS = (0.7, 1.0, 1.4), (0.8, 1.0, 1.25), (0.5, 2.0)
+#: Reading, in parts of the largest one, below which a setting is printed as 0.
+ZERO = 0.01
 #: Least mean decrease of the logarithm of an sd with which tests share the time with others.
 LEAST = 0.01
 #: Largest part of the information by which its differences with steps of 1 and 2 may differ: the motion changes its kind.
@@ -140,6 +143,10 @@ class Candidate:
             yield near.T if smooth else np.full_like(near.T, np.nan)
 
 
+#: Tests that share the time, and the ratios of the sds of the targets after and before them.
+Option = tuple[tuple[Candidate, ...], np.ndarray]
+
+
 @dataclass(frozen=True)
 class Plan:
     """Candidates in the order of their use.
@@ -186,26 +193,31 @@ def _repeated(
     e: PointTest, number: float, rows: np.ndarray, changed: Mapping[str, np.ndarray]
 ) -> tuple[Experiment, float]:
     """The test with so many trials, at most ``MOST_ROWS``, that repeat ``rows``; also the trials that each stands for."""
-    chosen = np.resize(rows, max(int(min(number, MOST_ROWS)), len(rows)))
-    return _remade(e, changed, chosen), number / len(chosen)
+    n = min(int(number), MOST_ROWS)
+    spread = rows if n >= len(rows) else rows[np.linspace(0, len(rows) - 1, n).round().astype(int)]
+    return _remade(e, changed, np.resize(spread, n)), number / n
 
 
 def _designs(e: PointTest, kind: Kind) -> Iterator[tuple[str, Mapping[str, np.ndarray], np.ndarray]]:
     """Which rows of its table, and with what settings, further trials may have: words, changed columns, rows."""
-    yield "", {}, np.arange(e.n)
     column = next((c for c in e.table.columns.values() if c.name != e.reading), None)
-    if column is None or np.ptp(column.values) == 0.0:
+    if column is None or e.reading not in e.table.columns or np.ptp(column.values) == 0.0:
+        yield "", {}, np.arange(e.n)
         return
     order = np.argsort(column.values, kind="stable")
+    low, high = (float(column.values[i]) for i in order[[0, -1]])
 
     def words(*values: float) -> str:
-        return f", {column.name} {' and '.join(f'{x * column.to_display:.3g}' for x in values)} {column.unit}"
+        # A reading of a zero is no setting.
+        shown = (x * column.to_display if abs(x) > ZERO * abs(high) else 0.0 for x in values)
+        return f", {column.name} {' and '.join(f'{x:.3g}' for x in shown)} {column.unit}"
 
-    low, high = (float(column.values[i]) for i in order[[0, -1]])
+    yield "", {}, order
     yield words(low, high), {}, order[[0, -1]]
-    for below, above in ((1.0, 1.0), BEYOND) if kind.set_by == column.name else ((1.0, 1.0),):
-        yield words(below * low), {column.name: below * column.values}, order[:1]
-        yield words(above * high), {column.name: above * column.values}, order[-1:]
+    if not kind.columns[column.name].varies:
+        for below, above in ((1.0, 1.0), BEYOND) if kind.set_by == column.name else ((1.0, 1.0),):
+            yield words(below * low), {column.name: below * column.values}, order[:1]
+            yield words(above * high), {column.name: above * column.values}, order[-1:]
 
 
 def _runs(e: CapsuleRun) -> Iterator[tuple[str, Experiment, Values]]:
@@ -233,6 +245,7 @@ def candidates(
     Also return what takes longer than that.
     """
     found, left_out, seen = list[Candidate](), list[str](), set[tuple[Any, ...]]()
+    own_labels = {table.label for table in rig.tables}
     for e in made:
         kind, own = (
             registry[e.kind],
@@ -246,18 +259,17 @@ def candidates(
         seen.add(own)
         starts = {name: start.centre for name, start in LogPosterior(e.rig, [e]).starts().items()}
         about = (number, number * each)
+        name = f"as {e.label}" if e.label in own_labels else f"{e.label} as in the synthetic rig"
         if isinstance(e, PointTest):
-            for words, changed, rows in _designs(e, kind):
+            for words, changed, rows in _designs(e, kind) if number > isinstance(e, Line) else ():
                 template, strength = _repeated(e, number, rows, changed)
-                found.append(Candidate(template, f"as {e.label}{words}", *about, strength, starts, {}))
+                found.append(Candidate(template, f"{name}{words}", *about, strength, starts, {}))
         elif isinstance(e, CapsuleRun):
-            found += [
-                Candidate(run, f"as {e.label}{words}", *about, number, starts, own) for words, run, own in _runs(e)
-            ]
+            found += [Candidate(run, f"{name}{words}", *about, number, starts, own) for words, run, own in _runs(e)]
         else:
             strength = number if e.time_series else number / e.n
             for part in AMPLITUDES if isinstance(e, DecayRecord) and not e.model.symbols else (1.0,):
-                words = f"as {e.label}" + (f", {part:g} x its amplitude" if part != 1.0 else "")
+                words = name + (f", {part:g} x its amplitude" if part != 1.0 else "")
                 found.append(Candidate(e, words, *about, strength * part**2, starts, {}))
     return found, left_out
 
@@ -272,7 +284,15 @@ def twins(known: Values, rig: Rig, kinds: Sequence[Kind], registry: Registry, se
     with tempfile.TemporaryDirectory() as folder:
         synthesize(Path(folder) / "next", seed, truth, "next", registry=Registry(tuple(kinds)))
         read = read_rig(Path(folder) / "next", registry)
+    ground = {"slope": rig.slope, "N0": rig.N0}
+    tables = tuple(
+        replace(table, settings=replace(table.settings, **ground))
+        if isinstance(table.settings, GroundSettings) and "angle" not in table.columns
+        else table
+        for table in read.tables
+    )
     own = {
+        "tables": tables,
         "m1": rig.m1 or read.m1,
         "m2": rig.m2 or read.m2,
         "g": rig.g,
@@ -295,6 +315,7 @@ def lines_of(e: Experiment, kind: Kind) -> str:
         rule = QuantityRule("s" if column.name == "time" else kind.columns[column.name].si)
         errors = {"sd": column.sd, "resolution": column.resolution}
         shown |= {f"{column.name}_{key}": _text(x, rule) for key, x in errors.items() if x is not None}
+        shown |= {f"{column.name}_instrument": json.dumps(column.instrument.name)} if column.instrument else {}
     header = ", ".join(f"{column.name} [{column.unit}]" for column in columns)
     return "\n".join(["[[experiment]]", *(f"{key} = {text}" for key, text in shown.items()), f"# columns: {header}"])
 
@@ -345,7 +366,7 @@ def next_tests(
     def sds(information: np.ndarray) -> np.ndarray:
         return np.sqrt(np.diagonal(np.linalg.inv(precision + information), axis1=1, axis2=2)[:, place]).mean(axis=0)
 
-    options, best = list[tuple[tuple[Candidate, ...], np.ndarray]](), dict[str, tuple[float, Candidate, np.ndarray]]()
+    options, best = list[Option](), dict[str, tuple[float, Candidate, np.ndarray]]()
     before = sds(np.zeros((1, *precision.shape)))
     for done, one in enumerate(found):
         if progress:
@@ -360,8 +381,17 @@ def next_tests(
             best[one.template.kind] = worth, one, information
     for (_, one, own), (_, other, further) in combinations(best.values(), 2):
         if one.tests > 1 and other.tests > 1:
-            options.append(((one, other), sds(0.5 * (own + further)) / before))
-    options.sort(key=_worth)
+            both = own * (one.tests // 2) / one.tests + further * (other.tests // 2) / other.tests
+            options.append(((one, other), sds(both) / before))
+    return _plan(result, targets, options, left_out)
+
+
+def _plan(result: Result, targets: Sequence[str], options: Sequence[Option], left_out: list[str]) -> Plan:
+    """The options in order, without those that change nothing."""
+    useful = [option for option in options if _worth(option) < -LEAST] or options
+    if len(useful) < len(options):
+        left_out.append(f"{counted(len(options) - len(useful), 'choice')} that change these sds by less than 1 %")
+    options = sorted(useful, key=_worth)
     today = {name: float(x) for name, x in zip(targets, result.summary["sd"][targets], strict=True)}
     rows = [_row(members, today, ratios) for members, ratios in options]
     table = pd.DataFrame(rows, index=pd.RangeIndex(1, len(rows) + 1))
@@ -400,7 +430,7 @@ def _precision(draws: np.ndarray, target: LogPosterior, names: Sequence[str]) ->
     return np.linalg.inv(np.cov(np.where(positive, np.log(np.where(positive, sample, 1.0)), sample).T))
 
 
-def _worth(option: tuple[Any, np.ndarray]) -> float:
+def _worth(option: Option) -> float:
     """Mean logarithm of the ratios: the smaller, the better."""
     return float(np.mean(np.log(option[1])))
 
@@ -412,7 +442,7 @@ def _row(members: Sequence[Candidate], today: Values, ratios: np.ndarray) -> dic
         "kind": " + ".join(one.template.kind for one in members),
         "tests": " + ".join(str(one.tests // len(members)) for one in members),
         "what": "; ".join(one.words for one in members),
-        "minutes": float(np.mean([one.minutes for one in members])),
+        "minutes": sum(one.minutes / one.tests * (one.tests // len(members)) for one in members),
         **{f"sd of {name}": sd * ratio for (name, sd), ratio in pairs},
         **{f"{name}, ratio": ratio for (name, _), ratio in pairs},
     }
@@ -436,39 +466,50 @@ def planned(folder: str | Path, registry: Registry, draws: int = DRAWS, seed: in
     Raises
     ------
     InputError
-        If rig.toml breaks a rule, states no tests or no mass, or plans a kind that the synthetic rig does not have.
+        If rig.toml breaks a rule, states no tests or no mass, or plans what the synthetic rig does not have.
     """
     rig = read_rig(folder, registry, planned=True)
-    place, tests = rig.folder / "rig.toml", rig.plan.get("tests", {})
     by_word = {kind.test or kind.name: kind for kind in registry.kinds}
-    known = [word for word, kind in by_word.items() if kind.bench and kind.twin]
-    if unknown := [word for word in tests if word not in known]:
-        remedy = f"choose from {', '.join(known)}"
-        raise InputError("[plan] tests can be planned for bench tests", unknown[0], remedy, place)
-    if not tests or rig.m1 is None or rig.m2 is None:
-        rule = "a plan needs m1 and m2 in [rig], and tests in [plan]"
-        raise InputError(rule, "not all of them", "write [plan] tests = { push = 10, free_vibration = 3 }", place)
+    tests = _planned_tests(rig, [word for word, kind in by_word.items() if kind.bench and kind.twin])
     rng, kinds = np.random.default_rng(seed), [by_word[word] for word in tests]
-    covariances, rows = list[np.ndarray](), list[Any]()
+    covariances, shown = list[np.ndarray](), list[Any]()
     for i in range(draws):
         made = twins(_drawn(rig, registry, rng), rig, kinds, registry, seed + i)
         target = LogPosterior(rig, made)
-        rows = [row for row in target.parameters if row.physical and not row.scatter]
-        names = [row.name for row in rows]
-        precision = np.diag(1.0 / np.array([prior_sd(row) for row in rows]) ** 2)
+        shown = [row for row in target.parameters if row.physical and not row.scatter]
+        names = [row.name for row in shown]
+        precision = np.diag(1.0 / np.array([prior_sd(row) for row in shown]) ** 2)
         values = {name: start.centre for name, start in target.starts().items()}
         for e in made:
-            number = tests[registry[e.kind].test or e.kind]
-            part = e, number / sum(other.kind == e.kind for other in made)
-            template, strength = _repeated(e, number, np.arange(e.n), {}) if isinstance(e, PointTest) else part
+            number = tests[registry[e.kind].test or e.kind] / sum(other.kind == e.kind for other in made)
+            if number < 2 and isinstance(e, Line):
+                continue
+            rows = np.arange(e.n)
+            template, strength = _repeated(e, max(number, 1), rows, {}) if isinstance(e, PointTest) else (e, number)
             own = Candidate(template, "", 1, 1.0, strength, values, {})
             precision = precision + own.information([values], names)[0]
         covariances.append(np.linalg.inv(precision))
-    sds, prior = np.sqrt([np.diag(each) for each in covariances]), np.array([prior_sd(row) for row in rows])
-    frame = words_of([row.name for row in rows], np.mean(covariances, axis=0), np.mean(sds, axis=0) / prior)
-    frame["sd / value"] = [float(np.mean(sds[:, i])) if row.positive else np.nan for i, row in enumerate(rows)]
+    sds, prior = np.sqrt([np.diag(each) for each in covariances]), np.array([prior_sd(row) for row in shown])
+    frame = words_of([row.name for row in shown], np.mean(covariances, axis=0), np.mean(sds, axis=0) / prior)
+    frame["sd / value"] = [float(np.mean(sds[:, i])) if row.positive else np.nan for i, row in enumerate(shown)]
     stated = rig.plan.get("minutes", {})
     return frame, sum(number * stated.get(word, by_word[word].minutes) for word, number in tests.items())
+
+
+def _planned_tests(rig: Rig, known: Sequence[str]) -> Mapping[str, float]:
+    """Numbers of tests by the ``known`` words, from [plan]."""
+    place, tests = rig.folder / "rig.toml", rig.plan.get("tests", {})
+    if wrong := [word for word, number in tests.items() if word not in known or number != int(number)]:
+        rule = "[plan] tests must be whole numbers of bench tests that the synthetic rig has"
+        raise InputError(rule, f"{wrong[0]} = {tests[wrong[0]]:g}", f"choose from {', '.join(known)}", place)
+    lines = {"m1": rig.m1, "m2": rig.m2, "tests = { push = 10, free_vibration = 3 }": tests}
+    if missing := [line for line, stated in lines.items() if not stated]:
+        rule, table = (
+            "a plan needs m1 and m2 in [rig], and tests in [plan]",
+            "[rig]" if missing[0] in "m1m2" else "[plan]",
+        )
+        raise InputError(rule, f"no {missing[0].split()[0]}", f"add {missing[0]} to {table}", place)
+    return tests
 
 
 def _drawn(rig: Rig, registry: Registry, rng: np.random.Generator) -> dict[str, float]:
