@@ -23,6 +23,7 @@ from capsule_id.errors import InputError, check_seed
 from capsule_id.experiments.kind import default_registry
 from capsule_id.output import replace_file, replace_files
 from capsule_id.parameters import QUANTILE_975, Prior
+from capsule_id.views import counted
 
 #: Factor of the log-normal priors about the paper's values, that of some parameters, and that of rigs with forced runs; scales
 #: of the half-normal priors of the noise levels that few readings determine, SI. The prior of v_s is narrower than its
@@ -209,7 +210,8 @@ def report(outcomes: list[dict[str, Any]], args: Namespace) -> int:
             [
                 shown.to_string(float_format="%.3g", na_rep=""),
                 *(f"rig {one['rig']} not fitted: {one['error']}" for one in outcomes if "error" in one),
-                f"{len(fitted)} of {len(outcomes)} rigs fitted, {sum(one['trust'] == 'trusted' for one in fitted)} trusted; "
+                f"fitted {len(fitted)} of {counted(len(outcomes), 'rig')}, "
+                f"{sum(one['trust'] == 'trusted' for one in fitted)} trusted; "
                 f"median {np.median([one['seconds'] for one in fitted] or np.nan):.1f} s a rig",
                 *(f"smallest p x number of parameters: {shown['p x parameters'].min():.2g}" for _ in fitted[:1]),
             ]

@@ -60,7 +60,7 @@ def write_new_files(written: Sequence[tuple[str, Path, bytes]], about: str = "")
         say(f"wrote {file}{about if option == '--out' else ''}")
 
 
-def say_failed(result: cid.Fit) -> None:
+def say_failed(result: "cid.Fit") -> None:
     """Print the failed checks of a result that is not trusted, and its verdict."""
     if result.trust != "trusted":
         failed = [f"fail {found.code}: {result.text(found)}" for found in result.findings if found.level == "fail"]

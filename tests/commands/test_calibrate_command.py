@@ -85,7 +85,7 @@ def test_ranks_of_the_exact_posterior_are_uniform(
     assert run(tmp_path / "study", 60) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert "60 of 60 rigs fitted, 60 trusted" in out
+    assert "fitted 60 of 60 rigs, 60 trusted" in out
     table = pd.read_csv(tmp_path / "study" / "calibration.csv", index_col="parameter")
     assert list(table.index) == [*calibrate.priors_of(Namespace(runs=False, set=[])), calibrate.LOG_PRIOR]
     assert f"smallest p x number of parameters: {table['p x parameters'].min():.2g}" in out
@@ -166,7 +166,7 @@ def test_a_rig_that_cannot_be_fitted_is_counted(
     assert run(tmp_path / "study", 3) == 0
     out = capsys.readouterr().out
     assert "rig 1 not fitted: RuntimeError: no finite log-posterior" in out
-    assert "2 of 3 rigs fitted" in out
+    assert "fitted 2 of 3 rigs" in out
 
 
 def test_a_study_without_a_fitted_rig_fails(
