@@ -16,6 +16,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pandas as pd
+from scipy.linalg import block_diag
 
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
@@ -93,9 +94,12 @@ class Candidate:
         found = np.zeros((len(draws), len(names), len(names)))
         slopes = (self._of_run if isinstance(e, CapsuleRun) else self._of_readings)(target, draws)
         for wide, slope in zip(found, slopes, strict=True):
-            whole = slope.T @ slope + np.diag(np.where(shared, 0.0, 1.0 / target.prior_sd[located] ** 2))
-            own, cross = whole[~shared][:, ~shared], whole[~shared][:, shared]
-            wide[np.ix_(place, place)] = whole[shared][:, shared] - cross.T @ np.linalg.solve(own, cross)
+            # Further columns are linear nuisances of the new readings alone, each with a standard normal prior.
+            held = np.append(shared, np.zeros(slope.shape[1] - len(rows), dtype=bool))
+            prior = np.append(1.0 / target.prior_sd[located] ** 2, np.ones(slope.shape[1] - len(rows)))
+            whole = slope.T @ slope + np.diag(np.where(held, 0.0, prior))
+            own, cross = whole[~held][:, ~held], whole[~held][:, held]
+            wide[np.ix_(place, place)] = whole[held][:, held] - cross.T @ np.linalg.solve(own, cross)
         return self.strength * found
 
     def _values(self, target: LogPosterior, draw: Values) -> dict[str, float]:
@@ -122,7 +126,7 @@ class Candidate:
             yield jacobian(residuals, u[located], step[located])
 
     def _of_run(self, target: LogPosterior, draws: Sequence[Values]) -> Iterator[np.ndarray]:
-        """The same for a run: motions at all draws and steps are one batch; its offsets are integrated out."""
+        """The same for a run: motions at all draws and steps are one batch. Offsets, gains and delays are further columns."""
         e: Any = self.template
         located, step = target.located, STEP * np.minimum(target.prior_sd, 1.0)
         at = [self._values(target, draw) for draw in draws]
@@ -130,17 +134,22 @@ class Candidate:
         moves = np.concatenate([size * np.diag(step)[located] for size in (1.0, -1.0, 2.0, -2.0)])
         theta = target.theta((u[:, None] + moves).reshape(-1, target.dimension))
         constants = {name: np.full(len(theta), x) for name, x in target.fixed.items()}
-        seen = e.predict(e.local({**constants, **dict(zip(target.names, theta.T, strict=True))}), np)
-        for k, values in enumerate(at):
-            part, columns = slice(k * len(moves), (k + 1) * len(moves)), []
-            noise = [values[f"noise_{name}[{e.shares_noise}]"] for name in e.names]
-            for channel, sd in zip(seen, noise, strict=True):
-                ahead, behind, far, further = np.split(np.asarray(channel)[part], 4)
-                one, two = ((a - b) / (2.0 * step[located, None]) for a, b in ((ahead, behind), (far, further)))
-                columns.append(np.stack([one, 0.5 * two]) / sd)
-            near, wide = np.concatenate([each - each.mean(axis=2, keepdims=True) for each in columns], axis=2)
-            smooth = np.linalg.norm(near - wide) <= SMOOTH * np.linalg.norm(near)
-            yield near.T if smooth else np.full_like(near.T, np.nan)
+        values = e.local({**constants, **dict(zip(target.names, theta.T, strict=True))})
+        seen = [
+            np.reshape(e.instrument(name, values)[0], (-1, 1)) * np.asarray(channel)
+            for name, channel in zip(e.names, e.predict(values, np), strict=True)
+        ]
+        for k, own in enumerate(at):
+            part, near, wide, nuisances = slice(k * len(moves), (k + 1) * len(moves)), [], [], []
+            for channel, shown in zip(e.channels, seen, strict=True):
+                sd = np.hypot(own[f"noise_{channel.name}[{e.shares_noise}]"], np.sqrt(channel.reading_variance))
+                ahead, behind, far, further = np.split(shown[part] / sd, 4)
+                near.append((ahead - behind).T / (2.0 * step[located]))
+                wide.append((far - further).T / (4.0 * step[located]))
+                nuisances.append(channel.misfit(0.5 * (ahead + behind)[0] * sd, e.time, None, np).design / sd)
+            smooth = np.linalg.norm(np.vstack(near) - np.vstack(wide)) <= SMOOTH * np.linalg.norm(np.vstack(near))
+            found = np.hstack([np.vstack(near), block_diag(*nuisances)])
+            yield found if smooth else np.full_like(found, np.nan)
 
 
 #: Tests that share the time, and the ratios of the sds of the targets after and before them.

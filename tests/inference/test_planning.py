@@ -15,11 +15,13 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference import planning
+from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.planning import Candidate, Plan, next_tests, planned
 from capsule_id.inference.result import Result
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Instrument, Quantity, Rig
 from capsule_id.synthetic import PAPER, Truth, synthesize
+from tests.cli_tools import DATA
 
 #: Posterior sds of the logarithms.
 SD = {"m1": 2e-3, "m2": 1e-3, "k1": 2e-3, "c": 3e-3, "mu": 9e-3, "v_s": 8e-2, "K": 1e-2}
@@ -89,6 +91,43 @@ def test_pushes_of_one_speed_tell_one_combination_of_mu_and_v_s(rig: Rig) -> Non
     # The variance depends on the parameters too: a part of the derivative of a residual whose mean is 0.
     assert found == pytest.approx(4.0 * np.outer(slope, slope) / variance, rel=2e-2)
     assert np.linalg.svd(found)[1][1] < 1e-6 * np.trace(found)
+
+
+@pytest.mark.full
+def test_a_settled_run_tells_what_the_likelihood_of_a_run_does() -> None:
+    """Against the Jacobian that the fit uses, with gains and a delay that the settings state."""
+    whole = read_rig(DATA)
+    table = whole.cut("run_2", stop=0.3).tables[-3]
+    assert table.label == "run_2"
+    stated = {"start": "settled", "x_rel_gain_sd": 0.02, "acceleration_rod_gain_sd": 0.1, "x_rel_delay_sd": 1e-5}
+    table = replace(table, settings=replace(table.settings, **stated))
+    read: Any = make_experiments(replace(whole, tables=(table,)), "runs")[0]
+    starts = LogPosterior(read.rig, [read]).starts()
+    known = {**{name: start.centre for name, start in starts.items()}, **PAPER}
+    # Without residuals the derivatives of the nuisances' effects do not matter.
+    seen = zip(read.names, read.predict(read.local(known), np), strict=True)
+    columns = {name: replace(table.columns[name], values=np.asarray(values)) for name, values in seen}
+    table = replace(table, columns={**table.columns, **columns})
+    e: Any = make_experiments(replace(whole, tables=(table,)), "runs")[0]
+    target = LogPosterior(e.rig, [e])
+    names = ["m1", "m2", "k1", "c", "mu", "v_s", "K", "k2[stiff]"]
+    found = Candidate(e, "", 1, 1.0, 1.0, known, {}).information([known], names)[0]
+    u = target.unconstrain(np.array([known[name] for name in target.names]))
+    slope = linearised(target, u)[1][: -target.dimension]
+    order = [target.names[i] for i in target.located]
+    held = np.isin(order, names)
+    # By least squares: what the own parameters, with their priors, leave of the columns of the others.
+    prior = np.diag(1.0 / target.prior_sd[target.located])[~held]
+    whole_slope = np.vstack([slope, prior])
+    own = whole_slope[:, ~held]
+    rest = whole_slope[:, held] - own @ np.linalg.lstsq(own, whole_slope[:, held])[0]
+    expected = rest.T @ rest
+    place = [names.index(name) for name in order if name in names]
+    assert np.linalg.norm(found[np.ix_(place, place)] - expected) < 0.01 * np.linalg.norm(expected)
+    free = replace(table, settings=replace(table.settings, x_rel_gain_sd=None, acceleration_rod_gain_sd=None))
+    sharper: Any = make_experiments(replace(whole, tables=(free,)), "runs")[0]
+    more = Candidate(sharper, "", 1, 1.0, 1.0, known, {}).information([known], names)[0]
+    assert more[names.index("K"), names.index("K")] > 1.05 * found[names.index("K"), names.index("K")]
 
 
 def row_of(plan: Plan, what: str) -> Any:
