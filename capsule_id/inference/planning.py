@@ -148,7 +148,7 @@ class Candidate:
                 wide.append((far - further).T / (4.0 * step[located]))
                 nuisances.append(channel.misfit(0.5 * (ahead + behind)[0] * sd, e.time, None, np).design / sd)
             smooth = np.linalg.norm(np.vstack(near) - np.vstack(wide)) <= SMOOTH * np.linalg.norm(np.vstack(near))
-            found = np.hstack([np.vstack(near), block_diag(*nuisances)])
+            found = np.hstack([np.vstack(near), np.asarray(block_diag(*nuisances))])
             yield found if smooth else np.full_like(found, np.nan)
 
 
