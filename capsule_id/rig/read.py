@@ -119,7 +119,7 @@ def read_rig(
         model=model,
         slope=stated.get("slope"),
         N0=stated.get("N0"),
-        confirmed=read_confirmed(root, tables, stated),
+        confirmed=() if planned else read_confirmed(root, tables, stated),
         plan=plan,
     )
 
