@@ -177,6 +177,10 @@ def test_records_count_as_often_as_they_fit_into_the_time(rig: Rig) -> None:
 def test_kinds_share_the_time_where_both_help(rig: Rig) -> None:
     plan = next_tests(result_of(rig), ["c", "v_s"], minutes=30)
     assert " + " in plan.table.iloc[0]["kind"]
+    # Half the decays tell less of c than all of them in the whole time.
+    pair = plan.table[plan.table["kind"] == "free_vibration + dynamic_friction"].iloc[0]
+    assert pair["tests"].startswith("5 + ")
+    assert pair["c, ratio"] > 1.02 * plan.table.loc[plan.table["kind"] == "free_vibration", "c, ratio"].min()
     assert {"motor_current", "support_spring"}.isdisjoint(" + ".join(plan.table["kind"].head(3)).split(" + "))
     assert 'kind = "dynamic_friction"' in plan.lines()
     assert "speed_sd = { value = 0.005" in plan.lines()
