@@ -23,7 +23,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import CapsuleRun
 from capsule_id.experiments.free_vibration.record import DecayRecord
-from capsule_id.experiments.kind import Kind, Registry, make_experiments
+from capsule_id.experiments.kind import Kind, Registry, Values, make_experiments
 from capsule_id.experiments.point_test import Line, PointTest
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.least_squares import linearised
@@ -58,8 +58,6 @@ SMOOTH = 0.2
 
 #: Largest factor about the median of a prior within which a plan draws truths: farther away the synthetic tests do not fit.
 FACTOR = 1.5
-
-Values = Mapping[str, float]  # by name, SI
 
 
 @dataclass(frozen=True)
