@@ -175,7 +175,7 @@ class Parameter:
 
     def admits(self, value: Any) -> Any:
         """Whether ``value`` is finite and has an admissible sign, elementwise; number, NumPy or JAX array."""
-        bound = {"positive": value > 0.0, "not negative": value >= 0.0, "any": value == value}[self.sign]
+        bound = {"positive": value > 0.0, "not negative": value >= 0.0, "any": value > -np.inf}[self.sign]
         return bound if self.may_be_infinite else (abs(value) < np.inf) & bound
 
 
@@ -232,8 +232,8 @@ TABLE: Mapping[str, Parameter] = {
             leaf="capsule", sign="not negative", default=0.0,
         ),
         Parameter(
-            "G", "m", "gap between rod and support spring", "G",
-            leaf="capsule", sign="not negative", may_be_infinite=True,
+            "G", "m", "gap between rod and support spring; negative: it is compressed with the rod at rest", "G",
+            leaf="capsule", sign="any", may_be_infinite=True,
         ),
         Parameter(
             "g", "m/s^2", "acceleration of gravity", "g",
@@ -253,7 +253,7 @@ TABLE: Mapping[str, Parameter] = {
         ),
         Parameter(
             "G_back", "m", "gap between rod and back spring", "G_-",
-            leaf="capsule", sign="not negative", default=np.inf, may_be_infinite=True,
+            leaf="capsule", sign="any", default=np.inf, may_be_infinite=True,
         ),
         Parameter(
             "slope", "rad", "slope of the ground, +X uphill", r"\alpha",

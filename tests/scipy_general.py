@@ -28,6 +28,8 @@ def pulses(q: Values, end: float) -> Drive:
     return force, switches
 
 
+#: Modes after which a run is given up: its last states are NaN. An event that is found twice repeats for ever.
+MOST_MODES = 2000
 Mode = tuple[bool, bool, int, int]  # contact, back contact, direction of sliding (0: stuck), switches so far
 
 
@@ -86,11 +88,18 @@ class Capsule:
 
 
 def simulate_general(
-    q: Values, drive: Drive, times: np.ndarray, rtol: float = 1e-8, atol: float = 1e-11, rod: Any = None
+    q: Values,
+    drive: Drive,
+    times: np.ndarray,
+    rtol: float = 1e-8,
+    atol: float = 1e-11,
+    rod: Any = None,
+    max_step: float = np.inf,
 ) -> tuple[np.ndarray, int]:
     """(states (n, 4) at ``times`` from rest, closings of the gap); q: every parameter of the capsule, and reaction.
 
     rod : X1 as a ``CubicSpline`` where the motion of the rod is given; its times must be in the switches
+    max_step : s, short where the gaps may open and close within a step: SciPy then misses both events
     """
     force, switches = drive
     capsule = Capsule(q, force, rod)
@@ -101,10 +110,18 @@ def simulate_general(
     sigma = capsule.sets_off(capsule.forces(t, y, (contact, back, 0, on))[1])
     out = np.full((len(times), 4), np.nan)
     out[0] = y
-    while t < times[-1]:
+    for _ in range(MOST_MODES):
+        if t >= times[-1]:
+            break
         mode = (contact, back, sigma, on)
         end = min([s for s in switches if s > t + 1e-13] + [times[-1]])
-        options = {"events": capsule.events(mode), "dense_output": True, "rtol": rtol, "atol": atol}
+        options = {
+            "events": capsule.events(mode),
+            "dense_output": True,
+            "rtol": rtol,
+            "atol": atol,
+            "max_step": max_step,
+        }
         run = solve_ivp(lambda t, y, mode=mode: capsule.field(t, y, mode), (t, end), y, "DOP853", **options)
         inside = (times > t) & (times <= run.t[-1])
         if inside.any():

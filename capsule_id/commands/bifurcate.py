@@ -425,8 +425,8 @@ def overlay(
     for table in rig.tables:
         if not isinstance(table.settings, RunSettings):
             continue
-        if table.settings.drive == "base" or table.settings.spring is None:
-            found = "no harmonic force, or no support spring"
+        if table.settings.drive == "base" or table.settings.spring is None or table.settings.spring_back is not None:
+            found = "no harmonic force, no support spring, or a spring behind the rod"
         else:
             found = _point_or_reason(table, _settings(table, known), over, x, values, spring)
         if isinstance(found, str):

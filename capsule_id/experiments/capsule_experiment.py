@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol, clock_parameters, scatter_prior, stretch
 from capsule_id.experiments.dynamic_friction import DynamicFriction
+from capsule_id.experiments.forced_run.declaration import SWITCHED
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.readings import DecayModel
@@ -27,7 +28,7 @@ from capsule_id.experiments.friction_model import (
     other_laws,
 )
 from capsule_id.experiments.point_test import PointTest
-from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.parameters import Name, Parameter, Prior, parameter
 from capsule_id.physics.forces import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory
 from capsule_id.physics.simulation import simulate
@@ -44,20 +45,39 @@ def stated_parameters(
     of: str = "",
     kind: Literal["normal", "positive_normal"] = "positive_normal",
 ) -> list[Parameter]:
-    """The parameter with the prior of a stated quantity; [] where nothing is stated, or an exact value."""
+    """The parameter with the prior of a stated quantity; [] where nothing is stated, or an exact value.
+
+    A quantity that is stated as not positive, as the gap of a compressed spring, has a normal prior.
+    """
     if stated is None or stated.sd == 0.0:
         return []
-    return [parameter(symbol, of, Prior(kind, stated.value, stated.sd))]
+    return [parameter(symbol, of, Prior(kind if stated.value > 0.0 else "normal", stated.value, stated.sd))]
+
+
+def support_parameters(table: Table, friction: FrictionModel, of: str) -> list[Parameter]:
+    """The parameters of the springs in front of the rod and behind it, and of their gaps of the record ``of``."""
+    s = table.settings
+    back = [] if s.spring_back in (None, s.spring) else [parameter("k2", s.spring_back)]
+    gaps = [*stated_parameters("G", s.gap, of), *stated_parameters("G_back", s.gap_back, of)]
+    return [*friction.support(s.spring), *back, *gaps]
 
 
 def lag_parameters(table: Table, rig: Rig) -> list[Parameter]:
     """The parameter lag of a drive, with its stated prior or, where [model] sets it free, the default one; or []."""
-    lag, is_free = table.settings.lag, table.settings.drive == "pulses" and "lag" in rig.model.free
+    lag, is_free = table.settings.lag, table.settings.drive in SWITCHED and "lag" in rig.model.free
     return [parameter("lag")] if lag is None and is_free else stated_parameters("lag", lag)
 
 
 #: Settings that hold a number of the motion, by symbol.
-STATED = {"G": "gap", "P_d": "P_d", "P_on": "P_on", "lag": "lag", "duty": "duty", NORMAL_FORCE: "normal_force"}
+STATED = {
+    "G": "gap",
+    "G_back": "gap_back",
+    "P_d": "P_d",
+    "P_on": "P_on",
+    "lag": "lag",
+    "duty": "duty",
+    NORMAL_FORCE: "normal_force",
+}
 
 
 def exact_values(table: Table) -> dict[str, float]:
@@ -70,7 +90,8 @@ def exact_values(table: Table) -> dict[str, float]:
 def stated_starts(of: str, **quantities: Quantity | None) -> dict[str, Start]:
     """Starts of ``stated_parameters`` by name."""
     uncertain = {symbol: q for symbol, q in quantities.items() if q is not None and q.sd > 0.0}
-    return {f"{symbol}[{of}]": Start(q.value, 0.5 * q.sd / q.value) for symbol, q in uncertain.items()}
+    scales = {symbol: q.value if q.value > 0.0 else 1.0 for symbol, q in uncertain.items()}
+    return {f"{symbol}[{of}]": Start(q.value, 0.5 * q.sd / scales[symbol]) for symbol, q in uncertain.items()}
 
 
 #: Widths a quarter of the certified ones.
@@ -114,12 +135,20 @@ class CapsuleForward(GroundExperiment):
     def law(self, theta: ValuesBySymbol) -> FrictionLaw:
         return super().law({**self.exact, **theta})
 
+    def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values by symbol; k2 is that of the spring in front of the rod, k2_back that of the spring behind it."""
+        own, settings = super().local(values), self.table.settings
+        if getattr(settings, "spring_back", None) is None:
+            return own
+        front = 0.0 if settings.spring is None else values[str(Name("k2", settings.spring))]
+        return own | {"k2": front, "k2_back": values[str(Name("k2", settings.spring_back))]}
+
     def parameters_of(self, theta: ValuesBySymbol) -> CapsuleParameters:
         """Capsule parameters at ``theta``; mu and v_s are placeholders where another friction law replaces them.
 
-        k2 is 0, and the gap infinite, where there is no support spring.
+        Stiffnesses are 0, and gaps infinite, where there is no spring.
         """
-        gap = {**self.exact, **theta}.get("G", np.inf)
+        known = {**self.exact, **theta}
         return CapsuleParameters(
             m1=theta["m1"],
             m2=theta["m2"],
@@ -130,7 +159,9 @@ class CapsuleForward(GroundExperiment):
             g=theta["g"],
             k_cubic=theta.get("k_cubic", 0.0),
             c2=theta.get("c2", 0.0),
-            **self.friction.support_at(theta, gap),
+            **self.friction.support_at(theta, known.get("G", np.inf)),
+            k2_back=theta.get("k2_back", 0.0),
+            G_back=known.get("G_back", np.inf),
             **self.ground_at(theta),
         )
 
@@ -174,8 +205,7 @@ class CapsuleDecay(CapsuleForward, DecayRecord):
         DecayRecord.__init__(self, table, rig, friction, DecayModel())
         self.set_model(table, rig, friction)
         rows = [parameter("k1"), parameter("c"), *friction.parameters]
-        rows += [] if table.settings.gap is None else friction.support(table.settings.spring)
-        rows += stated_parameters("G", table.settings.gap, table.label)
+        rows += support_parameters(table, friction, table.label)
         rows.append(parameter("x_start", table.label, Prior("normal", 0.0, self.width)))
         rows.append(parameter("y_start", table.label, Prior("normal", 0.0, self.width * self.rough.Omega_o)))
         rows += [NOISE_SD.named(table.label, scatter_prior(float(np.ptp(self.values)))), *ground_parameters(table, rig)]
@@ -198,7 +228,7 @@ class CapsuleDecay(CapsuleForward, DecayRecord):
             **DecayRecord.starts(self),
             f"x_start[{self.label}]": Start(float(self.values[0] - equilibrium(self.values)), 0.02 * size),
             f"y_start[{self.label}]": Start(float(rate), 0.05 * self.rough.Omega_o * size),
-            **stated_starts(self.label, G=self.table.settings.gap),
+            **stated_starts(self.label, G=self.table.settings.gap, G_back=self.table.settings.gap_back),
         }
 
 

@@ -251,6 +251,8 @@ def _leaves(
     progressions = [table.settings for table in rig.tables if isinstance(table.settings, ProgressionSettings)]
     stated += [(name, getattr(own, name)) for own in progressions for name in (AMPLITUDE[drive], "lag")]
     values |= {name: quantity.value for name, quantity in stated if quantity is not None}
+    runs = [table.settings for table in rig.tables if isinstance(table.settings, RunSettings)]
+    values |= next((behind for run in runs if (behind := _behind(run, chosen))), {})
     values |= {**result.fixed, **chosen} | ({} if spring is None else {"k2": springs[spring]}) | dict(given)
     needed = {name for name in own if LEAVES[name].default is None} - searched
     for name in sorted(needed):
@@ -260,6 +262,12 @@ def _leaves(
             several = f"; or choose the spring from {', '.join(springs)}" if name == "k2" and springs else ""
             raise InputError(f"tune needs {name} ({leaf.meaning})", "the fit has none", remedy + several)
     return {name: x for name, x in values.items() if name in own and x is not None and name not in searched}
+
+
+def _behind(run: RunSettings, chosen: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """k2_back, (draws,) N/m, and G_back, m, of a run with a spring behind the rod; {} without one."""
+    k2 = chosen.get(f"k2[{run.spring_back}]")
+    return {} if run.gap_back is None or k2 is None else {"k2_back": k2, "G_back": run.gap_back.value}
 
 
 def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: str) -> list[tuple[str, Values, float]]:
@@ -293,7 +301,7 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
         force = chosen["K"] * current.amplitude if current and "K" in chosen else amplitude and amplitude.value
         if k2 is None or force is None:
             continue
-        own = {"k2": k2, "G": stated_gap(table).value, AMPLITUDE[drive]: force, **ground}
+        own = {"k2": k2, "G": stated_gap(table).value, AMPLITUDE[drive]: force, **ground, **_behind(settings, chosen)}
         Omega = stated_Omega(table)
         own |= {"Omega": Omega} if drive == "harmonic" else {"period": 2.0 * np.pi / Omega, "duty": settings.duty}
         found.append((table.label, own, measured_motion(table).mean_velocity))

@@ -38,6 +38,7 @@ from capsule_id.rig.plateaus import Plateaus, read_plateaus, readings_of_plateau
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
     RIG_WORDS,
+    SPRINGS_AND_GAPS,
     TABLE_KEYS,
     ColumnRule,
     Entry,
@@ -182,7 +183,14 @@ def _read_priors(
     entries = root.get("prior", {}).table("[prior]")
     rows = {row.symbol: row for row in parameters if row.prior_can_be_stated}
     known = ["k2[<spring>]" if symbol == "k2" else symbol for symbol in sorted(rows, key=lambda s: rows[s].scatter)]
-    springs = sorted({table.settings.spring for table in tables or () if getattr(table.settings, "spring", None)})
+    springs = sorted(
+        {
+            name
+            for table in tables or ()
+            for key, _ in SPRINGS_AND_GAPS
+            if (name := getattr(table.settings, key, None)) is not None
+        }
+    )
     priors, whole = dict[str, Prior](), tables is not None and not faults
     for key in entries.value:
         node, spring = entries[key], re.fullmatch(rf"k2\[({NAME_PATTERN})\]", key)

@@ -200,6 +200,20 @@ class NameRule:
         return node.name()
 
 
+#: Keys of the support springs of the rod, in front and behind, with those of their gaps.
+SPRINGS_AND_GAPS = (("spring", "gap"), ("spring_back", "gap_back"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupportSettings(GroundSettings):
+    """Support springs in front of the rod and behind it, by name, with their gaps, m; a negative one: pre-compressed."""
+
+    spring: Annotated[str | None, NameRule()] = None
+    gap: Annotated[Quantity | None, QuantityRule("m", ANY, has_sd=True)] = None
+    spring_back: Annotated[str | None, NameRule()] = None
+    gap_back: Annotated[Quantity | None, QuantityRule("m", ANY, has_sd=True)] = None
+
+
 #: A whole number, 1 or more.
 COUNT = PlainRule(is_count, "be a whole number, 1 or more", "write e.g. 10", WHOLE)
 
@@ -240,24 +254,25 @@ class Entry(Generic[S]):
                 f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it',
             )
 
-    def check_spring_with_gap(self) -> None:
+    def check_springs_with_gaps(self) -> None:
         """Require a gap where a spring is within reach.
 
         Raises
         ------
         InputError
-            At the one of spring and gap that stands alone.
+            At the one of spring and gap that stands alone, in front of the rod or behind it.
         """
-        settings: Any = self.table.settings
-        if (settings.spring is None) != (settings.gap is None):
-            one, other = ("spring", "gap") if settings.gap is None else ("gap", "spring")
-            raise self.error(
-                one,
-                "spring and gap must stand together",
-                f"{one} alone",
-                f"add {other}, or remove {one} where the support spring is out of reach",
-                of_key=True,
-            )
+        for pair in SPRINGS_AND_GAPS:
+            alone = [key for key in pair if getattr(self.table.settings, key) is not None]
+            if len(alone) == 1:
+                (one,), (other,) = alone, {*pair} - {*alone}
+                raise self.error(
+                    one,
+                    f"{' and '.join(pair)} must stand together",
+                    f"{one} alone",
+                    f"add {other}, or remove {one} where the spring is out of reach",
+                    of_key=True,
+                )
 
     def check_length(self) -> None:
         """Refuse a record that is too short to fit.

@@ -17,16 +17,17 @@ from capsule_id.records.tones import FEWEST_IN_PERIOD, recorded_drive, stated_Om
 from capsule_id.records.view import describe_run
 from capsule_id.rig.filters import median_step, uneven_sampling
 from capsule_id.rig.model import Column, Quantity, Rig, Table
-from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings, NameRule, QuantityRule
+from capsule_id.rig.schema import ColumnRule, Entry, QuantityRule, SupportSettings
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE
 from capsule_id.views import Facts, Finding, Message, stated_p
 
 # rules: Rules on the drive of a forced run: what each kind of drive needs, and what it does not have.
 
 
-#: Drives of a run: a harmonic force, a prescribed motion of the rod, pulses, K times the recorded current.
-HARMONIC, BASE, PULSES, RECORDED = DRIVES = ("harmonic", "base", "pulses", "recorded")
-FORCES = (HARMONIC, PULSES, RECORDED)
+#: Drives of a run: a harmonic force, a prescribed motion of the rod, pulses, a force of one size that changes its sign, K
+#: times the recorded current.
+HARMONIC, BASE, PULSES, SQUARE, RECORDED = DRIVES = ("harmonic", "base", "pulses", "square", "recorded")
+FORCES, SWITCHED = (HARMONIC, PULSES, SQUARE, RECORDED), (PULSES, SQUARE)
 
 
 class DriveRule(NamedTuple):
@@ -111,15 +112,16 @@ DRIVE_RULES = (
     ),
     *(
         DriveRule(
-            (HARMONIC, RECORDED), stated(key), key, f'only drive = "pulses" has {key}', key, f"remove {key}", of_key=True
+            (HARMONIC, RECORDED), stated(key), key, f"only pulses and square waves have {key}", key, f"remove {key}",
+            of_key=True,
         )
         for key in ("duty", "P_on", "lag")
     ),
     DriveRule(
-        (PULSES, RECORDED), stated("P_d"), "P_d", 'drive = "{drive}" has no amplitude P_d', "P_d", "remove P_d", of_key=True
+        (*SWITCHED, RECORDED), stated("P_d"), "P_d", 'drive = "{drive}" has no amplitude P_d', "P_d", "remove P_d", of_key=True
     ),
     DriveRule(
-        (BASE, PULSES, RECORDED), lambda settings, columns: settings.start == "settled", "start",
+        (BASE, *SWITCHED, RECORDED), lambda settings, columns: settings.start == "settled", "start",
         'start = "settled" needs a harmonic force', 'drive = "{drive}"', 'write start = "auto"',
     ),
     DriveRule(
@@ -127,15 +129,15 @@ DRIVE_RULES = (
         'drive = "recorded" needs the column current and another channel', "{columns}", "add it",
     ),
     DriveRule(
-        (PULSES,), present("current"), "drive", "pulses have no column current", "{columns}",
+        SWITCHED, present("current"), "drive", 'drive = "{drive}" has no column current', "{columns}",
         'write drive = "recorded", or remove the column',
     ),
     *(
         DriveRule(
-            (PULSES,), lambda settings, columns, key=key: getattr(settings, key) is None, "drive",
-            f'drive = "pulses" needs {key}', "none", f"add {key} = {{{{ value = ..., unit = ... }}}}",
+            drives, lambda settings, columns, key=key: getattr(settings, key) is None, "drive",
+            f'drive = "{{drive}}" needs {key}', "none", f"add {key} = {{{{ value = ..., unit = ... }}}}",
         )
-        for key in ("duty", "P_on")
+        for key, drives in (("duty", (PULSES,)), ("P_on", SWITCHED))
     ),
     DriveRule(
         (HARMONIC,), lambda settings, columns: settings.P_d is None and "current" not in columns, "",
@@ -282,7 +284,7 @@ ChannelSettings: Any = make_dataclass(
         for error, unit in (("gain", "1"), ("delay", "s"))
         for name, *_ in _CHANNELS
     ],
-    bases=(GroundSettings,),
+    bases=(SupportSettings,),
     frozen=True,
     kw_only=True,
 )
@@ -294,16 +296,20 @@ RUN_SPRINGS = {"hard": 59410.0}
 
 #: Module with the classes of runs and of their twin, and the class of each drive.
 PLACE = "capsule_id.experiments.forced_run"
-RUNS_OF_DRIVES = {HARMONIC: "ForcedRun", BASE: "BaseRun", PULSES: "PulseRun", RECORDED: "RecordedRun"}
+RUNS_OF_DRIVES = {
+    HARMONIC: "ForcedRun",
+    BASE: "BaseRun",
+    PULSES: "PulseRun",
+    SQUARE: "PulseRun",
+    RECORDED: "RecordedRun",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(ChannelSettings):
     """Settings of a forced run, SI; see ``ChannelSettings`` for sds of gain and delay."""
 
-    drive: Literal["harmonic", "base", "pulses", "recorded"] = "harmonic"
-    spring: Annotated[str | None, NameRule()] = None
-    gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
+    drive: Literal["harmonic", "base", "pulses", "square", "recorded"] = "harmonic"
     Omega: Annotated[float | None, QuantityRule("rad/s")] = None
     f: Annotated[float | None, QuantityRule("Hz")] = None
     P_d: Annotated[Quantity | None, QuantityRule("N", has_sd=True)] = None
@@ -362,11 +368,15 @@ TEMPLATE = """\
 # file = "run_01.csv"
 # spring = "L60"
 # gap = { value = 1.0, sd = 0.02, unit = "mm" }
+#: a spring behind the rod. A gap of either is negative where the spring is compressed with the rod at rest
+# spring_back = "L60"
+# gap_back = { value = 2.0, sd = 0.02, unit = "mm" }
 # Omega = { value = 34.56, unit = "rad/s" }
 # P_d = { value = 4.0, sd = 0.1, unit = "N" }
 #: "harmonic" (default): P_d cos(Omega t + phase); "base": a column x_base [mm] prescribes the motion of the rod. Then
 #: x_capsule or x_rel is needed, P_d and m1 are not, and the frequency is that of x_base. spring and gap: optional
 #: "pulses": duty = { value = 30, unit = "%" }, P_on = { value = 1.2, sd = 0.3, unit = "N" } and optionally lag;
+#: "square": P_on and -P_on in turn, half a period each where no duty is stated;
 #: "recorded": K times the column current is the force, whatever its form
 # drive = "harmonic"
 #: normal force on the ground where it is not (m1 + m2) g
@@ -505,7 +515,7 @@ KIND = Kind(
     optional=("x_base",),
     channels=tuple(NOISE),
     settings=RunSettings,
-    rules=(Entry.check_spring_with_gap, Entry.check_length, partial(check_drive, DRIVE_RULES)),
+    rules=(Entry.check_springs_with_gaps, Entry.check_length, partial(check_drive, DRIVE_RULES)),
     masses=lambda table: ("m2",) if table.settings.drive == "base" else ("m1", "m2"),  # a prescribed rod needs no mass
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
     read_by=("gain",),

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import LEVEL, Fitted, Start, ValuesBySymbol, axis_label, band, stacked, stretch
-from capsule_id.experiments.forced_run.declaration import SETTLING_PERIODS
+from capsule_id.experiments.forced_run.declaration import SETTLING_PERIODS, SQUARE
 from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, before_samples, growth
 from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
@@ -116,8 +116,9 @@ def held_rod(theta: Mapping[str, float], P_d: float, Omega: float, G: float) -> 
 
     The rod starts from rest. A capsule at rest sticks while |f| <= F_b, so the test for its motion is exact.
     """
-    m1, k1, c, k2 = (float(theta.get(name, 0.0)) for name in ("m1", "k1", "c", "k2"))
-    capsule = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=G)
+    m1, k1, c, k2, k2_back = (float(theta.get(name, 0.0)) for name in ("m1", "k1", "c", "k2", "k2_back"))
+    behind = {"k2_back": k2_back, "G_back": float(theta.get("G_back", np.inf))}
+    capsule = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=G, **behind)
     held, e = without_absent(capsule, Excitation(P_d, Omega))
 
     def rate(t: float, state: np.ndarray) -> list[float]:
@@ -144,7 +145,7 @@ def contact_time(m1: float, m2: float, k2: float) -> float:
 def lint_feasibility(table: Table, rig: Rig, estimate: Estimate) -> list[Finding]:
     """Report quantities that the run cannot measure, at rough values."""
     settings = table.settings
-    if settings.drive != "harmonic" or settings.ground:
+    if settings.drive != "harmonic" or settings.ground or settings.spring_back is not None:
         return []
     names = {symbol: symbol for symbol in ("k1", "c", "mu") + (("K",) if settings.P_d is None else ())}
     names |= {} if settings.spring is None else {"k2": f"k2[{settings.spring}]"}
@@ -167,7 +168,7 @@ def check_feasible(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
         theta = run.local(fit.values)
         p, e = run.capsule(theta)
         F_b, P_d, G = (float(x) for x in (run.law(theta).forward(0.0), e.P_d, p.G))  # pyright: ignore
-        findings += feasibility(run.table, theta, F_b, P_d, G)
+        findings += feasibility(run.table, {**run.exact, **theta}, F_b, P_d, G)
     return findings
 
 
@@ -424,11 +425,12 @@ class RecordedRun(OtherRun):
 
 
 class PulseRun(OtherRun):
-    """One record driven by pulses of stated period and duty, which act since long before the first sample."""
+    """One record driven by pulses, or a square wave, of stated period, which act since long before the first sample."""
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
-        own = {"lag": 0.0, **self.exact, **theta}
-        wave = own["P_on"], 2.0 * np.pi / self.Omega, own["duty"]
+        own = {"lag": 0.0, "duty": 0.5, **self.exact, **theta}
+        off = -own["P_on"] if self.table.settings.drive == SQUARE else 0.0
+        wave = own["P_on"], 2.0 * np.pi / self.Omega, own["duty"], off
         return self.parameters_of(theta), Pulses(*wave, phase=own["phase"], lag=own["lag"], reaction=self.reaction)
 
     def simulated(

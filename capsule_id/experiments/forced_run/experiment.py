@@ -11,7 +11,13 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, scatter_prior, stated_rate, stretch
-from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_parameters, stated_parameters, stated_starts
+from capsule_id.experiments.capsule_experiment import (
+    CapsuleForward,
+    lag_parameters,
+    stated_parameters,
+    stated_starts,
+    support_parameters,
+)
 from capsule_id.experiments.forced_run.declaration import (
     CAPSULE_START,
     CORRELATION,
@@ -204,8 +210,7 @@ class CapsuleRun(CapsuleForward):
         damped = self.spring is not None and self.friction.contact is None
         rows += [parameter(name) for name in ("k_cubic", "c2")[: 1 + damped] if name in free]
         rows += [*clock_parameters(self.table, self.rig), *instrument_parameters(self.table)]
-        rows += self.friction.support(self.spring)
-        rows += stated_parameters("G", settings.gap, whole)
+        rows += support_parameters(self.table, self.friction, whole)
         if "current" in self.names:
             amplitude = 0.5 * float(np.ptp(self.table["current"]))
             rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
@@ -242,7 +247,7 @@ class CapsuleRun(CapsuleForward):
             return starts
         return starts | {
             f"phase[{of}]": Start(rough.phase, 0.02),
-            **stated_starts(of, G=settings.gap, P_d=settings.P_d),
+            **stated_starts(of, G=settings.gap, G_back=settings.gap_back, P_d=settings.P_d),
             f"I_d[{of}]": Start(rough.amplitude, 0.005),
             **{f"noise_{name}[{of}]": Start(noise, 0.1) for name, noise in rough.noise.items()},
             **{f"ar1_{name}[{of}]": Start(0.0, 0.1) for name in self.names},

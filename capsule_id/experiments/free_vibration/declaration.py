@@ -330,7 +330,7 @@ KIND = Kind(
     settings=DecaySettings,
     divide=divide_at_releases,
     rules=(
-        Entry.check_spring_with_gap,
+        Entry.check_springs_with_gaps,
         _check_settings,
     ),
     masses=_masses,

@@ -115,10 +115,11 @@ def check_free_decay(records: Sequence[DecayRecord], fit: Fitted) -> list[Findin
             if force > threshold:
                 facts, doubtful = {"force": force, "F_b": threshold, "label": e.label}, () if free else ("c", *found)
                 findings.append(Finding("decays.slip", "fail" if free else "warn", facts, e.label, doubtful))
-        gap = e.table.settings.gap
-        reach = float(np.max(e.values - equilibrium(e.values))) if e.order == 0 else e.largest_deflection
-        if gap is not None and reach >= gap.value:
-            findings.append(Finding("decays.contact", "fail", {"reach": reach, "gap": gap.value}, e.label))
+        for gap, side in ((e.table.settings.gap, 1.0), (e.table.settings.gap_back, -1.0)):
+            moved = side * (e.values - equilibrium(e.values))
+            reach = float(np.max(moved)) if e.order == 0 else e.largest_deflection
+            if gap is not None and reach >= gap.value:
+                findings.append(Finding("decays.contact", "fail", {"reach": reach, "gap": gap.value}, e.label))
     return findings
 
 

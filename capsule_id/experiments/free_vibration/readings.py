@@ -11,9 +11,9 @@ from capsule_id.experiments.free_vibration.decrement import decay_frequency
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
 from capsule_id.rig.filters import loudest_part, median_step, uneven_sampling
-from capsule_id.rig.model import Quantity, Table
-from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, PlainRule, QuantityRule, WordsRule
-from capsule_id.rig.toml import ANY, NOT_NEGATIVE, Node, is_count, shown
+from capsule_id.rig.model import Table
+from capsule_id.rig.schema import COUNT, PlainRule, QuantityRule, SupportSettings, WordsRule
+from capsule_id.rig.toml import ANY, Node, is_count, shown
 
 # channels: Channels of a free decay: the displacement x_rel, its rate, or the rod's absolute acceleration.
 #
@@ -221,7 +221,7 @@ RELEASES = PlainRule(
 
 
 @dataclass(frozen=True, kw_only=True)
-class DecaySettings(GroundSettings):
+class DecaySettings(SupportSettings):
     """Settings of a free vibration, SI.
 
     Absent words of the model stand for viscous damping, a linear spring, no drift and white noise. Where the record
@@ -240,8 +240,6 @@ class DecaySettings(GroundSettings):
     thin: Annotated[int | None, COUNT] = None
     samples: Literal["record", "turning_points"] = "record"
     smoothing_window: Annotated[float | None, QuantityRule("s")] = None
-    spring: Annotated[str | None, NameRule()] = None
-    gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
     forward: Literal["closed", "capsule"] = "closed"
 
     @property

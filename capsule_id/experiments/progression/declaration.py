@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from capsule_id.experiments.forced_run.declaration import DriveRule, check_drive, lacks, present, stated
+from capsule_id.experiments.forced_run.declaration import SQUARE, DriveRule, check_drive, lacks, present, stated
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.lint import USUAL_PERIODS
 from capsule_id.parameters import Prior, nuisance, scatter
@@ -71,7 +71,7 @@ TRIAL_SD = scatter("trial_sd", "m", "absolute scatter of the displacement of a t
 DISCREPANCY = scatter("discrepancy", "m/s", "error of the model's mean velocity at a setting", r"\delta_v")
 
 #: Amplitude column of each drive; ``current`` times K is another amplitude of both.
-AMPLITUDE = {"pulses": "P_on", "harmonic": "P_d"}
+AMPLITUDE = {"pulses": "P_on", "square": "P_on", "harmonic": "P_d"}
 #: Fewest settings of a table that show more than their own scatter.
 FEWEST_SETTINGS = 6
 
@@ -84,7 +84,7 @@ class ProgressionSettings(GroundSettings):
     With heavy ``tails`` a trial may be outlying.
     """
 
-    drive: Literal["pulses", "harmonic"] = "pulses"
+    drive: Literal["pulses", "square", "harmonic"] = "pulses"
     P_on: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
     P_d: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
     lag: Annotated[Quantity | None, QuantityRule("s", NOT_NEGATIVE, has_sd=True)] = None
@@ -113,7 +113,8 @@ DRIVE_RULES = (
             (drive,), lambda settings, columns, other=other: getattr(settings, other) is not None or other in columns,
             "drive", f'drive = "{drive}" has the amplitude {own}', other, f"rename {other} to {own}, or correct the drive",
         )
-        for (drive, own), other in zip(AMPLITUDE.items(), reversed(AMPLITUDE.values()), strict=True)
+        for drive, own in AMPLITUDE.items()
+        for other in {*AMPLITUDE.values()} - {own}
     ),
     DriveRule(("pulses",), lacks("duty"), "drive", _DUTY, "{columns}", "add the column duty"),
     DriveRule(("harmonic",), present("duty"), "drive", _DUTY, "{columns}", "remove the column duty"),
@@ -166,7 +167,7 @@ TEMPLATE = """\
 # [[experiment]]
 # kind = "progression"
 # file = "progression.csv"
-# drive = "pulses"                                    # or "harmonic"
+# drive = "pulses"                                    # "harmonic", or "square": P_on and -P_on in turn
 # P_on = { value = 1.25, sd = 0.5, unit = "N" }
 # lag = { value = 5, sd = 2, unit = "ms" }
 # tails = "normal"                                    # or "heavy": one trial of a setting may be outlying
@@ -260,7 +261,9 @@ def settings_of(columns: Mapping[str, Column], settings: ProgressionSettings) ->
     source = next((name for name in (own, "current") if name in columns), None)
     kind = {own: "column", "current": "current"}.get(source or "", "setting")
     amplitude = one if source is None else values[source]
-    return np.stack([period, values["periods"], values.get("duty", one), amplitude], axis=1), kind
+    # A square wave has its two signs for equal times where no duty is stated.
+    duty = values.get("duty", 0.5 * one if settings.drive == SQUARE else one)
+    return np.stack([period, values["periods"], duty, amplitude], axis=1), kind
 
 
 def sessions_of(table: Table, rows: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from capsule_id.experiments.base import About, Fitted, Start, ValuesBySymbol, band, stacked
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_parameters, stated_parameters
+from capsule_id.experiments.forced_run.declaration import SQUARE
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, ground_parameters
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.progression.declaration import (
@@ -246,7 +247,8 @@ class Progression(CapsuleForward):
         p = self.parameters_of(theta)
         if self.drive == "harmonic":
             return p, Excitation(force, 2.0 * np.pi / period, 0.0, self.reaction)
-        return p, Pulses(force, period, duty, lag=own["lag"], reaction=self.reaction)
+        off = -force if self.drive == SQUARE else 0.0
+        return p, Pulses(force, period, duty, off, lag=own["lag"], reaction=self.reaction)
 
     def runs(self, theta: ValuesBySymbol) -> Any:
         """(..., runs) X2 of the runs of ``sessions``, m, by the exact or the smoothed engine; see ``displacements``."""
@@ -359,7 +361,7 @@ class Progression(CapsuleForward):
 
     def _duty_and_amplitude(self, row: np.ndarray) -> str:
         """Duty and amplitude of a row of settings, where they may differ."""
-        duty = f", duty {100.0 * row[2]:g} %" if self.drive == "pulses" else ""
+        duty = f", duty {100.0 * row[2]:g} %" if self.drive != "harmonic" else ""
         return duty + {"column": f", {row[3]:g} N", "current": f", {row[3]:g} A"}.get(self.amplitude_from, "")
 
     def new_trials(self, draws: Sequence[ValuesBySymbol], settings: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,0 +1,221 @@
+"""Springs on both sides of the rod, compressed springs and square waves: engines, runs, progressions and their faults."""
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id.api import fit, read_rig
+from capsule_id.experiments.forced_run.experiment import CapsuleRun
+from capsule_id.experiments.kind import make_experiments
+from capsule_id.physics.drives import Pulses
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.simulation import simulate
+from tests.rig.faults import fault_of
+from tests.scipy_general import Values, pulses, simulate_general
+
+LEAVES = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g", "k2_back", "G_back")
+ABSENT = {"g": 9.81, "k_cubic": 0.0, "c2": 0.0, "slope": 0.0, "N0": 0.0, "ratio": 0.5, "viscous": 0.0, "reaction": 0.0}
+TRUTH = {
+    "m1": 0.11, "m2": 0.53, "k1": 1420.0, "k2": 9000.0, "c": 3.89, "mu": 0.3, "v_s": 0.3, "G": -2e-4, "k2_back": 5000.0,
+    "G_back": 8e-4, "mu_back": 0.3, **ABSENT,
+}  # fmt: skip
+NOISE, TIME = 1e-5, np.arange(600) / 1000.0
+P_D, OMEGA, PHASE = 8.0, 60.0, 0.4
+PERIOD, LAG = 0.09, 0.004
+HEAD = '[rig]\nname = "run"\nm1 = { value = 110, unit = "g" }\nm2 = { value = 530, unit = "g" }\n'
+RUN = '\n[[experiment]]\nkind = "forced_run"\nfile = "run.csv"\nstart = "stuck"\n'
+SPRINGS = (
+    'spring = "a"\ngap = { value = -0.2, sd = 0.02, unit = "mm" }\n'
+    'spring_back = "b"\ngap_back = { value = 0.8, sd = 0.02, unit = "mm" }\n'
+)
+HARMONIC = 'Omega = { value = 60, unit = "rad/s" }\nP_d = { value = 8, sd = 0.2, unit = "N" }\n'
+SQUARE = (
+    'drive = "square"\nf = { value = 11.111111, unit = "Hz" }\nP_on = { value = 6, sd = 2, unit = "N" }\n'
+    'lag = { value = 4, sd = 1, unit = "ms" }\n'
+)
+
+
+def cases() -> Iterator[tuple[Values, np.ndarray, np.ndarray]]:
+    """Drawn capsules with a square wave, times, and states by SciPy where two tolerances agree: it may miss an event."""
+    rng = np.random.default_rng(3)
+    while True:
+        low = {
+            "m1": 0.08,
+            "m2": 0.3,
+            "k1": 800,
+            "k2": 2e3,
+            "c": 1.0,
+            "mu": 0.1,
+            "v_s": 0.05,
+            "k2_back": 2e3,
+            "G_back": -5e-4,
+        }
+        high = {
+            "m1": 0.2,
+            "m2": 0.8,
+            "k1": 2e3,
+            "k2": 3e4,
+            "c": 6.0,
+            "mu": 0.5,
+            "v_s": 0.5,
+            "k2_back": 3e4,
+            "G_back": 2e-3,
+        }
+        q = {name: float(rng.uniform(low[name], high[name])) for name in low}
+        q |= {
+            **ABSENT,
+            "mu_back": q["mu"],
+            "G": float(rng.uniform(-5e-4, 1.5e-3)),
+            "P_on": float(rng.uniform(2.0, 8.0)),
+        }
+        q |= {
+            "P_off": -q["P_on"],
+            "period": 2.0 * np.pi / rng.uniform(20, 90),
+            "duty": 0.5,
+            "lag": rng.uniform(1e-3, 6e-3),
+        }
+        times = np.linspace(0.0, 4.0 * q["period"], 80)
+        wave, steps = pulses(q, times[-1]), ((1e-9, 5e-4), (1e-11, 3e-4))
+        rough, fine = (simulate_general(q, wave, times, tol, tol / 100, max_step=step)[0] for tol, step in steps)
+        if np.all(np.abs(rough - fine)[:, [0, 2]] < 1e-8):
+            yield q, times, fine
+
+
+@pytest.mark.parametrize("number", [3, pytest.param(20, marks=pytest.mark.full)])
+def test_the_exact_engine_against_scipy(number: int) -> None:
+    compressed = False
+    for q, times, expected in islice(cases(), number):
+        drive = Pulses(q["P_on"], q["period"], 0.5, q["P_off"], lag=q["lag"])
+        t = simulate(CapsuleParameters(**{name: q[name] for name in LEAVES}), drive, times)
+        assert np.max(np.abs(np.stack([t.X1, t.X2], axis=1) - expected[:, [0, 2]])) < 1e-8
+        compressed |= min(q["G"], q["G_back"]) < 0.0
+    assert compressed
+
+
+def harmonic(q: Values) -> np.ndarray:
+    return simulate_general(q, (lambda t, on: P_D * np.cos(OMEGA * t + PHASE), []), TIME, 1e-10, 1e-12)[0]
+
+
+def write(folder: Path, states: np.ndarray, settings: str, seed: int = 1) -> None:
+    """A record of x_rel and x_capsule with noise, and its rig."""
+    rng = np.random.default_rng(seed)
+    x = np.stack([states[:, 0] - states[:, 2], states[:, 2]], axis=1) + NOISE * rng.standard_normal((len(TIME), 2))
+    rows = [f"{t:.4f},{a:.9g},{b:.9g}" for t, (a, b) in zip(TIME, x, strict=True)]
+    (folder / "run.csv").write_text("\n".join(["time [s],x_rel [m],x_capsule [m]", *rows]))
+    (folder / "rig.toml").write_text(HEAD + RUN + settings)
+
+
+def run_of(folder: Path) -> CapsuleRun:
+    (run,) = make_experiments(read_rig(folder))
+    return run
+
+
+def largest_residual(run: CapsuleRun, own: Values) -> float:
+    """Largest rms residual of a channel, in units of the noise."""
+    start = {"x_start": 0.0, "y_start": 0.0, "noise_x_rel": NOISE, "noise_x_capsule": NOISE, "phase": PHASE}
+    return max(float(np.sqrt(np.mean(left**2))) for _, left in run.records({**TRUTH, **start, **own}))
+
+
+def test_a_record_with_two_springs_is_white_at_the_truth_alone(tmp_path: Path) -> None:
+    write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS)
+    run = run_of(tmp_path)
+    assert {"k2[a]", "k2[b]", "G[run]", "G_back[run]"} <= {row.name for row in run.parameters}
+    assert largest_residual(run, {"P_d": P_D}) < 1.15
+    for changed in ({"k2_back": 5300.0}, {"G_back": 7.5e-4}, {"G": -1.5e-4}):
+        assert largest_residual(run, {"P_d": P_D, **changed}) > 1.5
+
+
+def test_springs_are_told_apart_by_name(tmp_path: Path) -> None:
+    """One spring may stand on both sides; without a spring in front k2 is 0."""
+    write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS)
+    values = {"k2[a]": 9000.0, "k2[b]": 5000.0}
+    run = run_of(tmp_path)
+    known = {row.name: 1.0 for row in run.parameters} | values
+    assert {name: run.local(known)[name] for name in ("k2", "k2_back")} == {"k2": 9000.0, "k2_back": 5000.0}
+    toml = (tmp_path / "rig.toml").read_text()
+    (tmp_path / "rig.toml").write_text(toml.replace('spring_back = "b"', 'spring_back = "a"'))
+    same = run_of(tmp_path)
+    assert [row.name for row in same.parameters if row.symbol == "k2"] == ["k2[a]"]
+    assert same.local(known)["k2_back"] == 9000.0
+    behind = "".join(line for line in SPRINGS.splitlines(keepends=True) if "_back" in line)
+    (tmp_path / "rig.toml").write_text(HEAD + RUN + HARMONIC + behind)
+    assert run_of(tmp_path).local(known)["k2"] == 0.0
+
+
+@pytest.mark.full
+def test_a_fit_finds_both_springs_and_gaps(tmp_path: Path) -> None:
+    """With the springs' own tests; a fit without the spring behind the rod fails."""
+    rng = np.random.default_rng(2)
+    write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS)
+    entries = ""
+    for name, k2 in (("a", TRUTH["k2"]), ("b", TRUTH["k2_back"])):
+        x = np.linspace(0.2, 2.0, 10)
+        rows = [f"{d:.3f},{1e-3 * k2 * d + 0.02 * rng.standard_normal():.4f}" for d in x]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["deflection [mm],force [N]", *rows]))
+        entries += f'\n[[experiment]]\nkind = "support_spring"\nspring = "{name}"\nfile = "{name}.csv"\n'
+    (tmp_path / "rig.toml").write_text(HEAD + RUN + HARMONIC + SPRINGS + entries)
+    result = fit(read_rig(tmp_path), budget=None)
+    truth = {"k2[a]": 9000.0, "k2[b]": 5000.0, "k1": 1420.0, "mu": 0.3}
+    for name, value in truth.items():
+        assert abs(result[name].value - value) < 4.0 * result[name].sd
+    assert result["k2[b]"].sd < 0.02 * TRUTH["k2_back"]
+    behind = "".join(line for line in SPRINGS.splitlines(keepends=True) if "_back" not in line)
+    (tmp_path / "rig.toml").write_text(HEAD + RUN + HARMONIC + behind + entries)
+    assert not fit(read_rig(tmp_path), budget=None).verdict.clean
+
+
+def square(q: Values, times: np.ndarray, begin: float = 0.0) -> np.ndarray:
+    """States under a square wave that began at 0, from rest at ``begin``."""
+    wave = {"P_on": 6.0, "P_off": -6.0, "period": PERIOD, "duty": 0.5, "lag": LAG}
+    force, switches = pulses({**q, **wave}, begin + times[-1])
+    early = sum(s <= begin for s in switches)
+    later = [s - begin for s in switches if s > begin]
+    return simulate_general(q, (lambda t, on: force(t + begin, on + early), later), times, 1e-10, 1e-12)[0]
+
+
+def test_a_square_wave_explains_a_record(tmp_path: Path) -> None:
+    begin = 50 * PERIOD + 0.013
+    write(tmp_path, square(TRUTH, TIME, begin), SQUARE + SPRINGS)
+    own = {"P_on": 6.0, "lag": LAG, "phase": 2.0 * np.pi * 0.013 / PERIOD}
+    run = run_of(tmp_path)
+    assert largest_residual(run, own) < 1.15
+    assert largest_residual(run, {**own, "P_on": 6.3}) > 3.0
+
+
+def test_a_progression_under_a_square_wave(tmp_path: Path) -> None:
+    q = {**TRUTH, "k2": 0.0, "G": np.inf, "k2_back": 0.0, "G_back": np.inf}
+    wave = {"P_on": 6.0, "P_off": -6.0, "duty": 0.35, "lag": LAG}
+    rows = []
+    for period in (0.06, 0.09):
+        end = np.array([0.0, 10 * period])
+        X2 = simulate_general(q, pulses({**q, **wave, "period": period}, end[-1]), end, 1e-10, 1e-12)[0][-1, 2]
+        rows.append((1e3 * period, 35, 10, X2))
+    text = ["period [ms],duty [%],periods [1],distance [m]", *(f"{a:g},{b},{n},{x:.9g}" for a, b, n, x in rows)]
+    (tmp_path / "progression.csv").write_text("\n".join(text))
+    entry = '\n[[experiment]]\nkind = "progression"\nfile = "progression.csv"\ndrive = "square"\n'
+    entry += 'P_on = { value = 6, unit = "N" }\nlag = { value = 4, unit = "ms" }\n'
+    (tmp_path / "rig.toml").write_text(HEAD + entry)
+    (trials,) = make_experiments(read_rig(tmp_path))
+    found = np.asarray(trials.displacements(q, np.zeros(2), trials.settings))
+    assert found.ravel() == pytest.approx([row[-1] for row in rows], abs=1e-6)
+    assert abs(found.ravel()).min() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("settings", "rule", "instead"),
+    [
+        (HARMONIC + 'spring_back = "b"\n', "spring_back and gap_back must stand together", HARMONIC + SPRINGS),
+        (HARMONIC + SPRINGS.replace('spring = "a"\n', ""), "spring and gap must stand together", HARMONIC + SPRINGS),
+        (SQUARE.replace("P_on", "P_d"), "has no amplitude P_d", SQUARE),
+        (SQUARE.replace("P_on = { value = 6, sd = 2, unit = \"N\" }\n", ""), 'drive = "square" needs P_on', SQUARE),
+        (HARMONIC + 'lag = { value = 4, unit = "ms" }\n', "only pulses and square waves have lag", SQUARE),
+    ],
+)
+def test_a_fault_is_named_and_its_remedy_works(tmp_path: Path, settings: str, rule: str, instead: str) -> None:
+    write(tmp_path, np.zeros((len(TIME), 4)), settings)
+    assert rule in str(fault_of(tmp_path))
+    (tmp_path / "rig.toml").write_text(HEAD + RUN + instead)
+    read_rig(tmp_path)
