@@ -37,7 +37,7 @@ def counted(lines: list[dict]) -> Counter[tuple[str, str]]:
     return Counter((line["family"], line["end"]) for line in lines)
 
 
-@pytest.mark.parametrize(("first", "last"), [(0, 120), (120, 300)])
+@pytest.mark.parametrize(("first", "last"), [(0, 120), pytest.param(120, 300, marks=pytest.mark.full)])
 def test_three_hundred_inputs(whole: Path, first: int, last: int) -> None:
     lines = fuzz.ends(first, last, whole)
     assert faults(lines) == []

@@ -28,7 +28,7 @@ result.trust = "trusted"
     ("title", "printed"),
     [
         ("Simulate three drives at once", "P-1-F-3"),
-        ("A second spring behind the rod", "55 22 2.39"),
+        pytest.param("A second spring behind the rod", "55 22 2.39", marks=pytest.mark.full),
         ("Pulses in the place of a cosine", "duty 50%: 24."),
         pytest.param("Make a rig folder from arrays", "trusted", marks=pytest.mark.full),
     ],

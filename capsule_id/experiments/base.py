@@ -234,9 +234,14 @@ class Experiment(eqx.Module):
         """Effect (n,) on the readings, SI, of what a setting that varies can show beside the law, by name of the setting."""
         return {}
 
+    @property
+    def names_by_key(self) -> dict[str, str]:
+        """Name of each parameter by the symbol, or the name, by which the likelihood knows its value."""
+        return {row.key: row.name for row in self.parameters}
+
     def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Select values by symbol from values by name."""
-        own = {row.key: values[row.name] for row in self.parameters}
+        own = {key: values[name] for key, name in self.names_by_key.items()}
         return own | {name: values[name] for name in (*self.masses, "g") if name in values}
 
     @property

@@ -39,19 +39,25 @@ from capsule_id.views import Facts
 # capsule experiment: Mixin for experiments whose forward model is the capsule model, exact or smoothed.
 
 
+#: Sds from 0 within which a gap may be negative.
+OPEN = 4.0
+
+
 def stated_parameters(
     symbol: str,
     stated: Quantity | None,
     of: str = "",
     kind: Literal["normal", "positive_normal"] = "positive_normal",
 ) -> list[Parameter]:
-    """The parameter with the prior of a stated quantity; [] where nothing is stated, or an exact value.
-
-    A quantity that is stated as not positive, as the gap of a compressed spring, has a normal prior.
-    """
+    """The parameter with the prior of a stated quantity; [] where nothing is stated, or an exact value."""
     if stated is None or stated.sd == 0.0:
         return []
-    return [parameter(symbol, of, Prior(kind if stated.value > 0.0 else "normal", stated.value, stated.sd))]
+    return [parameter(symbol, of, Prior("normal" if _is_open(symbol, stated) else kind, stated.value, stated.sd))]
+
+
+def _is_open(symbol: str, stated: Quantity) -> bool:
+    """Whether ``stated`` is a gap that may be negative: then the spring is compressed with the rod at rest."""
+    return symbol in ("G", "G_back") and stated.value < OPEN * stated.sd
 
 
 def support_parameters(table: Table, friction: FrictionModel, of: str) -> list[Parameter]:
@@ -90,7 +96,7 @@ def exact_values(table: Table) -> dict[str, float]:
 def stated_starts(of: str, **quantities: Quantity | None) -> dict[str, Start]:
     """Starts of ``stated_parameters`` by name."""
     uncertain = {symbol: q for symbol, q in quantities.items() if q is not None and q.sd > 0.0}
-    scales = {symbol: q.value if q.value > 0.0 else 1.0 for symbol, q in uncertain.items()}
+    scales = {symbol: 1.0 if _is_open(symbol, q) else q.value for symbol, q in uncertain.items()}
     return {f"{symbol}[{of}]": Start(q.value, 0.5 * q.sd / scales[symbol]) for symbol, q in uncertain.items()}
 
 
@@ -135,13 +141,15 @@ class CapsuleForward(GroundExperiment):
     def law(self, theta: ValuesBySymbol) -> FrictionLaw:
         return super().law({**self.exact, **theta})
 
-    def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values by symbol; k2 is that of the spring in front of the rod, k2_back that of the spring behind it."""
-        own, settings = super().local(values), self.table.settings
-        if getattr(settings, "spring_back", None) is None:
+    @property
+    def names_by_key(self) -> dict[str, str]:
+        """k2 is that of the spring in front of the rod, k2_back that of the spring behind it, which may be the same."""
+        settings, own = self.table.settings, super().names_by_key
+        behind = getattr(settings, "spring_back", None)
+        if behind is None:
             return own
-        front = 0.0 if settings.spring is None else values[str(Name("k2", settings.spring))]
-        return own | {"k2": front, "k2_back": values[str(Name("k2", settings.spring_back))]}
+        front = {} if settings.spring is None else {"k2": str(Name("k2", settings.spring))}
+        return {k: name for k, name in own.items() if k != "k2"} | front | {"k2_back": str(Name("k2", behind))}
 
     def parameters_of(self, theta: ValuesBySymbol) -> CapsuleParameters:
         """Capsule parameters at ``theta``; mu and v_s are placeholders where another friction law replaces them.

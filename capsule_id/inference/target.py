@@ -218,7 +218,7 @@ def make_groups(experiments: Sequence[Experiment], names: Sequence[str]) -> tupl
 def _group(experiments: Sequence[Experiment], members: Sequence[int], place: Mapping[str, int]) -> Group:
     """One group; ``place`` of every name among the entries of u."""
     first = experiments[0]
-    own = [{row.key: row.name for row in e.parameters} for e in experiments]
+    own = [e.names_by_key for e in experiments]
     sampled = [*dict.fromkeys(s for table in own for s in table), *(m for m in first.masses if m in place)]
     entries = tuple((s, tuple(place.get(table.get(s, s), len(place)) for table in own)) for s in sampled)
     stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves).astype(float)), *experiments)

@@ -118,6 +118,7 @@ def decrement_sd(count: int, seed: int) -> np.ndarray:
     return np.std(estimates, axis=0, ddof=1) / cramer_rao()
 
 
+@pytest.mark.full
 def test_replicates() -> None:
     """A small version of the next test: bounds of 4 standard errors of an sd and of a mean."""
     count = 600

@@ -91,6 +91,7 @@ def test_probabilities_in_both_tails_are_accurate(xp: ModuleType) -> None:
     np.testing.assert_allclose(np.asarray(found), expected, atol=1e-3)
 
 
+@pytest.mark.full
 def test_readings_that_no_friction_explains_have_the_density_of_the_tail() -> None:
     """A capsule that stays where friction is higher, and trials on the other side; probabilities are 0 as numbers."""
     z, at_nodes = np.linspace(-6.0, 6.0, 2001), np.array([[0.2, 0.1, 0.0, 0.0, 0.0]])

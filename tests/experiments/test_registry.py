@@ -54,7 +54,13 @@ _LOAD = (ChoiceRule(("weight", "pressed")), None)
 _FORWARD = (ChoiceRule(("closed", "capsule")), "closed")
 _FORCE = QuantityRule("N", ANY, has_sd=True)
 _LAG = QuantityRule("s", NOT_NEGATIVE, has_sd=True)
-_GAP = QuantityRule("m", NOT_NEGATIVE, has_sd=True)
+_GAP = QuantityRule("m", ANY, has_sd=True)
+_SUPPORTS = {
+    "spring": (NameRule(), None),
+    "gap": (_GAP, None),
+    "spring_back": (NameRule(), None),
+    "gap_back": (_GAP, None),
+}
 _GROUND: dict[str, tuple[SettingRule, object]] = {"slope": (SLOPE, None), "N0": (PRESSING_FORCE, None)}
 SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
     "free_vibration": {
@@ -71,8 +77,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "thin": (COUNT, None),
         "samples": (ChoiceRule(("record", "turning_points")), "record"),
         "smoothing_window": (QuantityRule("s"), None),
-        "spring": (NameRule(), None),
-        "gap": (_GAP, None),
+        **_SUPPORTS,
         "forward": _FORWARD,
     },
     "static_friction": {
@@ -93,9 +98,8 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
     "transducer": {"sd_ratio": (QuantityRule("1/N"), None)},
     "forced_run": {
         **_GROUND,
-        "drive": (ChoiceRule(("harmonic", "base", "pulses", "recorded")), "harmonic"),
-        "spring": (NameRule(), None),
-        "gap": (_GAP, None),
+        "drive": (ChoiceRule(("harmonic", "base", "pulses", "square", "recorded")), "harmonic"),
+        **_SUPPORTS,
         "Omega": (QuantityRule("rad/s"), None),
         "f": (QuantityRule("Hz"), None),
         "P_d": (QuantityRule("N", has_sd=True), None),
@@ -111,7 +115,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
     },
     "progression": {
         **_GROUND,
-        "drive": (ChoiceRule(("pulses", "harmonic")), "pulses"),
+        "drive": (ChoiceRule(("pulses", "square", "harmonic")), "pulses"),
         "P_on": (_FORCE, None),
         "P_d": (_FORCE, None),
         "lag": (_LAG, None),

@@ -1,6 +1,7 @@
 """The phase portrait: record and model through one filter, which lets the contacts pass."""
 
 import numpy as np
+import pytest
 
 from capsule_id.experiments.forced_run.drives import _filtered, _portrait
 from capsule_id.records.view import FILTER_ORDER
@@ -10,6 +11,7 @@ from tests.forced_runs import make, theta
 N = 1000
 
 
+@pytest.mark.full
 def test_the_portrait_shows_the_contacts_and_a_wrong_model() -> None:
     run = make(1, samples=N)
     (panel,) = _portrait(run, theta(1))

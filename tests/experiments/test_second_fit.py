@@ -299,6 +299,7 @@ def test_no_hum_is_found_where_there_is_none() -> None:
     assert hum_of(humming(size=0.3)) == 0.0
 
 
+@pytest.mark.full
 def test_hum_and_a_further_force_are_found_together_and_stated_hum_is_kept() -> None:
     tone = 20.0 * np.sin(2.0 * np.pi * 50.0 * TIME)
     (found,), _ = second_models([record(tone, DRY)])
@@ -357,7 +358,7 @@ def test_a_slow_release_is_told_from_a_further_force() -> None:
     ("ramp", "louder", "noise", "low", "high"),
     [
         (0.4, 1.0, "ar1", 0.0, 1e-6),
-        (1e-3, 5.0, "white", 0.0, 1e-3),
+        pytest.param(1e-3, 5.0, "white", 0.0, 1e-3, marks=pytest.mark.full),
         (1e-3, 1.0, "ar1", 0.05, 1.0),
         (1e-3, 1.0, "white", 0.05, 1.0),
     ],

@@ -227,6 +227,7 @@ def test_a_factor_in_a_header_leaves_the_unit_open(tmp_path: Path, header: str) 
         assert f'from = "{name}", unit = "{unit}"' in capsule_id.importing.propose_entry(tmp_path / "d.csv")
 
 
+@pytest.mark.full
 def test_each_block_of_a_record_that_a_line_interrupts_has_an_entry(tmp_path: Path) -> None:
     """Before: 400 rows with the release were read by no entry. Control: a footer of three rows is none."""
     for last, lines in ((400, [(403, 902), (2, 401)]), (897, [(2, 898)])):

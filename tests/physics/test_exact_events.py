@@ -11,6 +11,7 @@ from tests.capsule_cases import Cases, states_of
 RIG = CapsuleParameters(m1=0.1, m2=0.4, k1=1000.0, k2=20_000.0, c=2.0, mu=0.4, v_s=0.2, G=1e-3, g=10.0)
 
 
+@pytest.mark.full
 def test_restart_anywhere_continues_the_same_motion(cases: Cases) -> None:
     """Every sample of a run, in whatever mode, is a valid start of the rest of it."""
     p, e, T = cases.one("fig6_k2_20")

@@ -77,7 +77,7 @@ BAD = {
     "c": [-1.0],
     "mu": [-0.1, np.nan],
     "v_s": [0.0, -0.3],
-    "G": [-1e-3, np.nan],
+    "G": [-np.inf, np.nan],
     "g": [np.nan],
 }
 

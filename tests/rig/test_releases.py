@@ -52,7 +52,14 @@ def rig_of(folder: Path, time: np.ndarray, values: np.ndarray, lines: str = "") 
     return folder
 
 
-@pytest.mark.parametrize(("zeta", "sizes"), [(0.02, (2.0, -1.0, 1.5)), (0.1, (1.0, 3.0)), (0.3, (2.0, -2.0, 1.2))])
+@pytest.mark.parametrize(
+    ("zeta", "sizes"),
+    [
+        (0.02, (2.0, -1.0, 1.5)),
+        pytest.param(0.1, (1.0, 3.0), marks=pytest.mark.full),
+        pytest.param(0.3, (2.0, -2.0, 1.2), marks=pytest.mark.full),
+    ],
+)
 def test_each_release_begins_a_decay(tmp_path: Path, zeta: float, sizes: tuple[float, ...]) -> None:
     time, values, releases = pulled(zeta, sizes)
     rig = capsule_id.read_rig(rig_of(tmp_path, time, values, 'releases = "all"'))
@@ -70,6 +77,7 @@ def test_each_release_begins_a_decay(tmp_path: Path, zeta: float, sizes: tuple[f
     assert not codes & {"decays.release", "decays.second"}
 
 
+@pytest.mark.full
 def test_values_and_chosen_releases(tmp_path: Path) -> None:
     time, values, _ = pulled(0.05, (2.0, -1.0, 1.5))
     folder = rig_of(tmp_path, time, values, "releases = [1, 3]")

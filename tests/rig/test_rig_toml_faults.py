@@ -115,7 +115,7 @@ TOML_FAULTS = [
     ('value = 3, unit = "N/A"', 'value = 3, unit = ‸"N/m"', "unit must have the dimension of N/A"),
     ('spring = "L60"\nlength', 'spring = ‸"L 60"\nlength', "spring must be a name"),
     ("length = { value = 60", "length = { value = ‸-60", "length must be greater than 0"),
-    ("gap = { value = 1.0", "gap = { value = ‸-1.0", "gap must be 0 or greater"),
+    ("gap = { value = 1.0, sd = 0.02", "gap = { value = 1.0, sd = ‸-0.02", "sd of gap must be 0 or greater"),
     ("Omega = { value = 34.56", "Omega = { value = ‸0", "Omega must be greater than 0"),
     ('34.56, unit = "rad/s"', '34.56, unit = ‸"Hz"', "unit must have the dimension of rad/s"),
     (

@@ -425,12 +425,21 @@ class RecordedRun(OtherRun):
 
 
 class PulseRun(OtherRun):
-    """One record driven by pulses, or a square wave, of stated period, which act since long before the first sample."""
+    """One record driven by pulses, or a square wave, of stated period, which act since long before the first sample.
+
+    Attributes
+    ----------
+    off : force between the pulses over that of a pulse, -1 of a square wave
+    """
+
+    off: float
+
+    def read_drive(self, table: Table, rig: Rig) -> None:
+        self.off = -1.0 if table.settings.drive == SQUARE else 0.0
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         own = {"lag": 0.0, "duty": 0.5, **self.exact, **theta}
-        off = -own["P_on"] if self.table.settings.drive == SQUARE else 0.0
-        wave = own["P_on"], 2.0 * np.pi / self.Omega, own["duty"], off
+        wave = own["P_on"], 2.0 * np.pi / self.Omega, own["duty"], self.off * own["P_on"]
         return self.parameters_of(theta), Pulses(*wave, phase=own["phase"], lag=own["lag"], reaction=self.reaction)
 
     def simulated(

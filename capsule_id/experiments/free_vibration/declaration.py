@@ -313,7 +313,8 @@ TEMPLATE = """\
 #: window of the Savitzky-Golay filter for the paper's estimate; default: chosen from the record
 # smoothing_window = { value = 10, unit = "ms" }
 # x_rel_sd = { value = 0.02, unit = "mm" }
-#: a support spring within reach: both of spring = "L60" and gap = { value = 1.0, sd = 0.02, unit = "mm" }
+#: a support spring within reach: both of spring = "L60" and gap = { value = 1.0, sd = 0.02, unit = "mm" }; one behind the
+#: rod: spring_back and gap_back
 """
 
 

@@ -40,8 +40,9 @@ class Outlier:
 
 def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (n,) in units of the noise at the conditional mean of the nuisances, and J (n, p)."""
-    rows = [row for row in experiment.parameters if not row.scatter]
-    keys = [row.key for row in rows]
+    by_name = {row.name: row for row in experiment.parameters if not row.scatter}
+    keys = [key for key, name in experiment.names_by_key.items() if name in by_name]
+    rows = [by_name[experiment.names_by_key[key]] for key in keys]
     # The errors of instruments are near 0, and their sds are their sizes.
     sizes = [row.prior.spread if row.prior and row.symbol in INSTRUMENT_ERRORS else 1e-12 for row in rows]
 

@@ -222,6 +222,7 @@ def test_intervals_of_a_decay_with_an_amplitude_of_its_own_cover_under_misfit() 
     assert np.median(plain / widened) / 1.96 < 1.8
 
 
+@pytest.mark.full
 def test_a_failed_check_widens_the_parameters_of_a_decay_with_dry_friction(monkeypatch: pytest.MonkeyPatch) -> None:
     """As for a run, by differences: the derivatives of a decay with dry friction take as long to compile."""
     monkeypatch.setattr(verdict, "linearised", lambda *at: (plain_residuals(*at), plain_jacobian(*at)))
