@@ -180,7 +180,7 @@ def _numbers(table: Table[Any], kind: Kind, rig: Rig) -> Iterable[Number]:
         if not isinstance(rule, QuantityRule) or stated is None or key.endswith("_sd"):
             continue
         value, (usual, others) = stated.value if isinstance(stated, Quantity) else float(stated), _usual(rule, rig)
-        if key == "gap" and "x_rel" in table.columns:
+        if key in ("gap", "gap_back") and "x_rel" in table.columns:
             size = float(np.ptp(table["x_rel"])) / 2.0
             usual, others = (GAPS[0] * size, GAPS[1] * size), (f"{label}.x_rel",)
         if usual is not None:

@@ -509,13 +509,12 @@ def _planned_tests(rig: Rig, known: Sequence[str]) -> Mapping[str, float]:
     if wrong := [word for word, number in tests.items() if word not in known or number != int(number)]:
         rule = "[plan] tests must be whole numbers of bench tests that the synthetic rig has"
         raise InputError(rule, f"{wrong[0]} = {tests[wrong[0]]:g}", f"choose from {', '.join(known)}", place)
-    lines = {"m1": rig.m1, "m2": rig.m2, "tests = { push = 10, free_vibration = 3 }": tests}
+    lines = {f'[rig] {name} = {{ value = 0.1, unit = "kg" }}': getattr(rig, name) for name in ("m1", "m2")}
+    lines |= {"[plan] tests = { push = 10, free_vibration = 3 }": tests}
     if missing := [line for line, stated in lines.items() if not stated]:
-        rule, table = (
-            "a plan needs m1 and m2 in [rig], and tests in [plan]",
-            "[rig]" if missing[0] in "m1m2" else "[plan]",
-        )
-        raise InputError(rule, f"no {missing[0].split()[0]}", f"add {missing[0]} to {table}", place)
+        rule = "a plan needs m1 and m2 in [rig], and tests in [plan]"
+        table, name, rest = missing[0].split(" ", 2)
+        raise InputError(rule, f"no {name}", f"add e.g. {name} {rest} to {table}", place)
     return tests
 
 

@@ -44,7 +44,9 @@ def random_draws(result: Result, number: int, rng: np.random.Generator) -> dict[
         If nothing was sampled, or there are fewer draws.
     """
     if result.posterior is None:
-        raise InputError("draws need a sample", "the point fit alone", "fit without --no-sample (budget=None)")
+        raise InputError(
+            "draws need a sample", "the point fit alone", "fit without --no-sample, in Python without budget=None"
+        )
     flat = result.posterior.draws.reshape(-1, len(result.posterior.names))
     if not 1 <= number <= len(flat):
         raise InputError("draws must lie between 1 and the sample's", str(number), f"give at most {len(flat)}")

@@ -7,6 +7,7 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.experiments.forced_run.experiment import CapsuleRun, growth
+from capsule_id.experiments.forced_run.start_state import ROD_DAMPING, ROD_FREQUENCY
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.physics.drives import Pulses, RecordedDrive
 from capsule_id.physics.model import CapsuleParameters, Drive
@@ -108,6 +109,22 @@ def test_a_later_part_of_a_record_has_the_pulses_of_the_whole(tmp_path: Path) ->
     assert np.asarray(found.x_rel) == pytest.approx(np.asarray(exact.x_rel), abs=1e-9)
 
 
+@pytest.mark.parametrize(("P_on", "duty"), [(6.0, 0.4), (-6.0, 0.4), (6.0, 0.15)])
+def test_a_fit_starts_near_the_phase_of_the_pulses(tmp_path: Path, P_on: float, duty: float) -> None:
+    """A linear rod under pulses, harmonic by harmonic. (Before: half the duty off, and a square wave 90 degrees.)"""
+    phase, n = 1.1, np.arange(1, 40)
+    turns, omega = np.linspace(0.0, 1.0, 4096, endpoint=False), 2.0 * np.pi * n / PERIOD
+    tones = np.fft.rfft(np.where((turns + phase / (2.0 * np.pi)) % 1.0 < duty, P_on, 0.0))[n] / 2048
+    rod = tones / (ROD_FREQUENCY**2 - omega**2 + 2j * ROD_DAMPING * ROD_FREQUENCY * omega)
+    x_rel = np.real(np.exp(1j * np.outer(TIME, omega)) @ rod)
+    rows = [f"{t:.9g},{x:.9g},0" for t, x in zip(FIRST + TIME, x_rel, strict=True)]
+    (tmp_path / "run.csv").write_text("\n".join(["time [s],x_rel [m],x_capsule [m]", *rows]))
+    settings = PULSES.replace("value = 6, sd = 3", f"value = {P_on}, sd = 3").replace("40", f"{100 * duty:g}")
+    (tmp_path / "rig.toml").write_text(HEAD + RUN + settings)
+    start = run_of(tmp_path).starts()["phase[run]"].centre
+    assert abs(np.angle(np.exp(1j * (start - phase)))) < 0.1
+
+
 def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     current = np.interp(TIME, np.arange(0.0, 0.7, 0.05), 2.0 * rng.standard_normal(14))
@@ -125,7 +142,7 @@ def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:
     [
         ('drive = "recorded"\n', 'drive = "recorded" needs the column current', PULSES),
         ('drive = "pulses"\nP_on = { value = 6, unit = "N" }\n', 'drive = "pulses" needs duty', PULSES),
-        (PULSES.replace('drive = "pulses"\n', ""), 'only drive = "pulses" has duty', PULSES),
+        (PULSES.replace('drive = "pulses"\n', ""), "only pulses and square waves have duty", PULSES),
         (PULSES + 'P_d = { value = 1, unit = "N" }\n', 'drive = "pulses" has no amplitude P_d', PULSES),
     ],
 )  # fmt: skip

@@ -83,4 +83,4 @@ def test_a_plan_is_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.endswith("4 min of tests; sd / value: expected, in the mean over 2 draws of the priors\n")
     Path("rig.toml").write_text("\n".join(lines), encoding="utf-8")
     assert capsule_id(["plan"]) == 2
-    assert "add tests = { push = 10" in capsys.readouterr().err
+    assert "add e.g. tests = { push = 10" in capsys.readouterr().err

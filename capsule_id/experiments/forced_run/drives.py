@@ -322,10 +322,10 @@ def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
     except InputError:
         return []
     curves = [Curve("this fit", fitted[0] * unit, fitted[1])]
-    if run.spring is not None:
-        gap = (float(p.G) + offset) * unit  # pyright: ignore[reportArgumentType]
-        ends = np.array([fitted[1].min(), fitted[1].max()])
-        curves.append(Curve("support spring", np.array([gap, gap]), ends, role="paper"))
+    stops = (run.spring, "support spring", p.G), (run.table.settings.spring_back, "back spring", -p.G_back)
+    for name, of, stop in (one for one in stops if one[0] is not None):
+        place = np.full(2, (float(stop) + offset) * unit)  # pyright: ignore[reportArgumentType]
+        curves.append(Curve(f"{of} {name}", place, np.array([fitted[1].min(), fitted[1].max()]), role="paper"))
     label, points = f"{run.label}_phase_portrait", Points("record", recorded[0] * unit, recorded[1])
     axes = axis_label(column), "rate of x_rel, m/s"
     return [Comparison("phase_portrait", label, f"{run.label}: phase portrait", *axes, (points,), tuple(curves))]
@@ -436,6 +436,15 @@ class PulseRun(OtherRun):
 
     def read_drive(self, table: Table, rig: Rig) -> None:
         self.off = -1.0 if table.settings.drive == SQUARE else 0.0
+
+    def starts(self) -> dict[str, Start]:
+        """A pulse begins half the duty before its tone is largest; its phase counts from the first sample."""
+        starts, of = super().starts(), f"phase[{self.about.record}]"
+        turn = self.Omega * self.first + np.pi * (self.exact.get("duty", 0.5) + (self.table.settings.P_on.value < 0.0))
+        turned = (
+            {of: Start(np.angle(np.exp(1j * (starts[of].centre + turn))), starts[of].spread)} if of in starts else {}
+        )
+        return {**starts, **turned}
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         own = {"lag": 0.0, "duty": 0.5, **self.exact, **theta}
