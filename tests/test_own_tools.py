@@ -43,6 +43,7 @@ def test_size_counts_what_stands_there(tree: Path, capsys: pytest.CaptureFixture
     )
 
 
+@pytest.mark.full
 def test_faults_are_one_line_each_and_drawn_by_their_seed() -> None:
     """Each fault changes one line of code, which still compiles, and no two change the same line."""
     drawn = faults.drawn()

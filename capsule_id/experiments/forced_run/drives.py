@@ -441,10 +441,9 @@ class PulseRun(OtherRun):
         """A pulse begins half the duty before its tone is largest; its phase counts from the first sample."""
         starts, of = super().starts(), f"phase[{self.about.record}]"
         turn = self.Omega * self.first + np.pi * (self.exact.get("duty", 0.5) + (self.table.settings.P_on.value < 0.0))
-        turned = (
-            {of: Start(np.angle(np.exp(1j * (starts[of].centre + turn))), starts[of].spread)} if of in starts else {}
-        )
-        return {**starts, **turned}
+        if of in starts:
+            starts[of] = Start(float(np.angle(np.exp(1j * (starts[of].centre + turn)))), starts[of].spread)
+        return starts
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         own = {"lag": 0.0, "duty": 0.5, **self.exact, **theta}
