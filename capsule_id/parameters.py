@@ -232,7 +232,7 @@ TABLE: Mapping[str, Parameter] = {
             leaf="capsule", sign="not negative", default=0.0,
         ),
         Parameter(
-            "G", "m", "gap between rod and support spring; negative: it is compressed with the rod at rest", "G",
+            "G", "m", "gap between rod and support spring where x_rel = 0; negative: the spring reaches beyond", "G",
             leaf="capsule", sign="any", may_be_infinite=True,
         ),
         Parameter(
@@ -252,7 +252,7 @@ TABLE: Mapping[str, Parameter] = {
             leaf="capsule", sign="not negative", default=0.0,
         ),
         Parameter(
-            "G_back", "m", "gap between rod and back spring", "G_-",
+            "G_back", "m", "gap between rod and back spring where x_rel = 0; negative: as of G", "G_-",
             leaf="capsule", sign="any", default=np.inf, may_be_infinite=True,
         ),
         Parameter(

@@ -95,15 +95,16 @@ def simulate_general(
     atol: float = 1e-11,
     rod: Any = None,
     max_step: float = np.inf,
+    start: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, int]:
-    """(states (n, 4) at ``times`` from rest, closings of the gap); q: every parameter of the capsule, and reaction.
+    """(states (n, 4) at ``times`` from ``start``, closings of the gap); q: every parameter of the capsule, and reaction.
 
     rod : X1 as a ``CubicSpline`` where the motion of the rod is given; its times must be in the switches
     max_step : s, short where the gaps may open and close within a step: SciPy then misses both events
     """
     force, switches = drive
     capsule = Capsule(q, force, rod)
-    y, t, on, contacts = np.zeros(4), float(times[0]), 0, 0
+    y, t, on, contacts = np.array(start), float(times[0]), 0, 0
     if rod is not None:
         y[0], y[1] = rod(t), rod(t, 1)
     contact, back = y[0] - y[2] >= q["G"], y[0] - y[2] <= -q["G_back"]

@@ -425,7 +425,8 @@ def overlay(
     for table in rig.tables:
         if not isinstance(table.settings, RunSettings):
             continue
-        if table.settings.drive == "base" or table.settings.spring is None or table.settings.spring_back is not None:
+        s = table.settings
+        if s.drive != "harmonic" or s.spring is None or s.spring_back is not None:
             found = "no harmonic force, no support spring, or a spring behind the rod"
         else:
             found = _point_or_reason(table, _settings(table, known), over, x, values, spring)

@@ -56,7 +56,7 @@ def stated_parameters(
 
 
 def _is_open(symbol: str, stated: Quantity) -> bool:
-    """Whether ``stated`` is a gap that may be negative: then the spring is compressed with the rod at rest."""
+    """Whether ``stated`` is a gap that may be negative: then the spring reaches beyond x_rel = 0."""
     return symbol in ("G", "G_back") and stated.value < OPEN * stated.sd
 
 

@@ -349,6 +349,9 @@ def _check_laws(made: Sequence["Experiment"], model: "FrictionModel", rig: Rig) 
         rule, remedy = f"the contact of {model.name} describes one spring", "fit the runs of each spring by themselves"
         raise InputError(rule, ", ".join(springs), remedy, rig.folder / "rig.toml")
     for e in made:
+        if model.contact is not None and getattr(e.table.settings, "spring_back", None) is not None:
+            rule, remedy = f"the contact of {model.name} stands in front of the rod", "remove spring_back and gap_back"
+            raise InputError(rule, f"spring_back of {e.label}", remedy, rig.folder / "rig.toml")
         for mass in e.masses:
             if getattr(rig, mass) is None:
                 rule = f"the friction law {model.name} is in N, and {e.label} needs {mass}"

@@ -239,20 +239,27 @@ def _leaves(
         If the spring was not fitted, or a value is missing.
     """
     rig, springs = result.rig, by_index("k2", chosen)
-    spring = next(iter(springs)) if spring is None and len(springs) == 1 else spring
+    runs = [table.settings for table in rig.tables if isinstance(table.settings, RunSettings)]
+    front = [name for name in springs if name not in {run.spring_back for run in runs} - {run.spring for run in runs}]
+    spring = front[0] if spring is None and len(front) == 1 else spring
     if spring is not None and spring not in springs:
         raise InputError("spring must be a fitted one", spring, f"choose from {', '.join(springs) or 'none'}")
     own = {*CAPSULE_LEAVES, *DRIVES[drive]}
     values: dict[str, Any] = {name: LEAVES[name].default for name in DRIVES[drive]}
     values |= {"reaction": rig.model.share_of_reaction, "slope": 0.0, "N0": 0.0}
     # Without a support spring the rod moves freely.
-    values |= {"k2": 0.0, "G": np.inf} if not springs and not {"k2", "G"} & {*given, *searched} else {}
+    values |= {"k2": 0.0, "G": np.inf} if not front and not {"k2", "G"} & {*given, *searched} else {}
     stated = [(name, getattr(rig, name)) for name in ("m1", "m2", "g", "slope", "N0")]
     progressions = [table.settings for table in rig.tables if isinstance(table.settings, ProgressionSettings)]
     stated += [(name, getattr(own, name)) for own in progressions for name in (AMPLITUDE[drive], "lag")]
     values |= {name: quantity.value for name, quantity in stated if quantity is not None}
-    runs = [table.settings for table in rig.tables if isinstance(table.settings, RunSettings)]
-    values |= next((behind for run in runs if (behind := _behind(run, chosen))), {})
+    if len({(run.spring_back, run.gap_back) for run in runs}) > 1 and "k2_back" not in {*given, *searched}:
+        rule = "tune needs k2_back and G_back where the runs do not have the same spring behind the rod"
+        raise InputError(rule, "none", "give both, in N/m and m; k2_back = 0: none")
+    square = any(getattr(table.settings, "drive", "") == "square" for table in rig.tables)
+    if drive == "pulses" and square and "P_off" not in {*given, *searched}:
+        raise InputError("tune needs P_off after a fit of a square wave", "none", "give -P_on, or 0 for pulses")
+    values |= _behind(runs[0], chosen) if runs else {}
     values |= {**result.fixed, **chosen} | ({} if spring is None else {"k2": springs[spring]}) | dict(given)
     needed = {name for name in own if LEAVES[name].default is None} - searched
     for name in sorted(needed):
@@ -273,7 +280,8 @@ def _behind(run: RunSettings, chosen: Mapping[str, np.ndarray]) -> dict[str, Any
 def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: str) -> list[tuple[str, Values, float]]:
     """Measured operating points of this drive: label, settings by symbol, () or (draws,), and mean velocity, m/s.
 
-    Those of forced runs with a fitted spring or none, and of the settings of progressions (mean over the trials).
+    Those of forced runs with a fitted spring or none, and of the settings of progressions (mean over the trials); no square
+    waves.
     """
     found = list[tuple[str, Values, float]]()
     for table in result.rig.tables:
@@ -314,7 +322,10 @@ def _table(
     """``Tuning.table``."""
     rows, threshold = {}, MM_PER_M * (faster_than or 0.0)
     shown = list(dict.fromkeys([*best, *(name for _, own, _ in points for name in own)]))
-    everything = [{**model.leaves, **best, **own} for own in ({}, *(own for _, own, _ in points))]
+    leaves = {**model.leaves, **best}
+    # A point names its spring behind the rod, and the force between its pulses, where it has them.
+    none = {name: x for name, x in {"k2_back": 0.0, "G_back": np.inf, "P_off": 0.0}.items() if name in leaves}
+    everything = [leaves, *({**leaves, **none, **own} for _, own, _ in points)]
     settings = {
         name: np.stack([np.broadcast_to(one[name], model.draws) for one in everything]) for name in everything[0]
     }

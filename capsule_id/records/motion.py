@@ -283,6 +283,7 @@ def find_contacts(cycle: Cycle) -> Contacts:
     counts = set(spikes + crossings)
     words = ["/".join(map(str, one)) or "not recorded" for one in (spikes, crossings)]
     reason = first_true(
+        (any(length >= len(z) for _, length in stretches), "contacts: the rod does not leave the spring"),
         (len(counts) > 1, f"contacts: spikes {words[0]}, crossings of the gap {words[1]}"),
         (
             2 * agreeing <= cycles,
@@ -456,7 +457,9 @@ def measured_motion(table: Table) -> MeasuredMotion:
     scatter = float(np.hypot(repeat.noise_sd, repeat.scatter)) if repeat else 0.0
     contacts = None
     if period and relative and table.settings.spring is not None:
-        gap, acceleration = stated_gap(table), table["acceleration_rod"] if "acceleration_rod" in columns else None
+        # Contacts of a spring behind the rod bend the line of the acceleration.
+        shows = "acceleration_rod" in columns and table.settings.spring_back is None
+        gap, acceleration = stated_gap(table), table["acceleration_rod"] if shows else None
         cycle = Cycle(time, relative[0], acceleration, Omega, period * T, gap.value, gap.sd, scatter)
         contacts = find_contacts(cycle)
     mean_velocity = velocity.velocity if velocity else float("nan")

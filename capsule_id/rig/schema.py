@@ -206,7 +206,7 @@ SPRINGS_AND_GAPS = (("spring", "gap"), ("spring_back", "gap_back"))
 
 @dataclass(frozen=True, kw_only=True)
 class SupportSettings(GroundSettings):
-    """Support springs in front of the rod and behind it, by name, with their gaps, m; a negative one: pre-compressed."""
+    """Support springs in front of the rod and behind it, by name, with their gaps, m, from x_rel = 0 on."""
 
     spring: Annotated[str | None, NameRule()] = None
     gap: Annotated[Quantity | None, QuantityRule("m", ANY, has_sd=True)] = None

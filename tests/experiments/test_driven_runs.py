@@ -115,7 +115,7 @@ def test_a_fit_starts_near_the_phase_of_the_pulses(tmp_path: Path, P_on: float, 
     phase, n = 1.1, np.arange(1, 40)
     turns, omega = np.linspace(0.0, 1.0, 4096, endpoint=False), 2.0 * np.pi * n / PERIOD
     tones = np.fft.rfft(np.where((turns + phase / (2.0 * np.pi)) % 1.0 < duty, P_on, 0.0))[n] / 2048
-    rod = tones / (ROD_FREQUENCY**2 - omega**2 + 2j * ROD_DAMPING * ROD_FREQUENCY * omega)
+    rod = tones / (1.0 + 1j * LAG * omega) / (ROD_FREQUENCY**2 - omega**2 + 2j * ROD_DAMPING * ROD_FREQUENCY * omega)
     x_rel = np.real(np.exp(1j * np.outer(TIME, omega)) @ rod)
     rows = [f"{t:.9g},{x:.9g},0" for t, x in zip(FIRST + TIME, x_rel, strict=True)]
     (tmp_path / "run.csv").write_text("\n".join(["time [s],x_rel [m],x_capsule [m]", *rows]))

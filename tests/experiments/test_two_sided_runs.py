@@ -1,6 +1,7 @@
 """Springs on both sides of the rod, compressed springs and square waves: engines, runs, progressions and their faults."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -8,13 +9,18 @@ import numpy as np
 import pytest
 
 from capsule_id.api import fit, read_rig
+from capsule_id.commands.bifurcate import overlay
+from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.experiment import CapsuleRun
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.target import LogPosterior
+from capsule_id.inference.tuning import operating_points, tune
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.physics.simulation import simulate
+from tests.experiments.test_foreign_law import Hertz
+from tests.inference.test_tuning import fit_of
 from tests.rig.faults import fault_of
 from tests.scipy_general import Values, pulses, simulate_general
 
@@ -245,3 +251,59 @@ def test_a_fault_is_named_and_its_remedy_works(tmp_path: Path, settings: str, ru
     assert rule in str(fault_of(tmp_path))
     (tmp_path / "rig.toml").write_text(HEAD + RUN + instead)
     read_rig(tmp_path)
+
+
+def test_a_contact_of_ones_own_stands_in_front_of_the_rod(tmp_path: Path) -> None:
+    write(tmp_path, np.zeros((len(TIME), 4)), HARMONIC + SPRINGS.replace('"b"', '"a"'))
+    with pytest.raises(InputError, match="remove spring_back and gap_back"):
+        make_experiments(read_rig(tmp_path, contact=Hertz), contact=Hertz)
+
+
+def test_runs_with_a_spring_behind_the_rod_are_tuned_and_drawn_with_it_or_not_at_all(tmp_path: Path) -> None:
+    write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS)
+    rig, chosen = read_rig(tmp_path), {"k2[a]": np.array([9e3, 9.1e3]), "k2[b]": np.array([5e3, 5.1e3])}
+    ((_, settings, _),) = operating_points(fit_of({}, rig=rig), chosen, "harmonic")
+    assert settings["k2_back"] is chosen["k2[b]"]
+    assert settings["G_back"] == 8e-4
+    assert "a spring behind the rod" in overlay(rig, "Omega", (20.0, 90.0), {**TRUTH, "P_d": 8.0}, chosen)[1]
+    own = replace(rig.tables[0].settings, spring_back=None, gap_back=None)
+    other = replace(rig, tables=(*rig.tables, replace(rig.tables[0], label="other", settings=own)))
+    values = {"k1": 1420.0, "c": 3.9, "mu": 0.3, "v_s": 0.3, "k2[a]": 9e3, "k2[b]": 5e3}
+    with pytest.raises(InputError, match="do not have the same spring behind the rod"):
+        tune(fit_of(values, rig=other), {"P_d": (4.0, 8.0)}, {"Omega": 60.0, "G": 1e-3}, spring="a")
+    write(tmp_path, np.zeros((len(TIME), 4)), SQUARE + SPRINGS)
+    with pytest.raises(InputError, match="tune needs P_off"):
+        tune(fit_of(values, rig=read_rig(tmp_path)), {"P_on": (4.0, 8.0)}, {"period": 0.1, "duty": 0.5, "G": 1e-3})
+    assert "no harmonic force" in overlay(read_rig(tmp_path), "Omega", (20.0, 90.0), {**TRUTH, "P_d": 8.0}, chosen)[1]
+
+
+def test_a_free_decay_that_reaches_the_spring_behind_the_rod_fails(tmp_path: Path) -> None:
+    x = 2e-3 * np.exp(-17.0 * TIME) * np.cos(112.0 * TIME) + NOISE * np.random.default_rng(5).standard_normal(len(TIME))
+    rows = [f"{t:.4f},{a:.9g}" for t, a in zip(TIME, x, strict=True)]
+    (tmp_path / "run.csv").write_text("\n".join(["time [s],x_rel [m]", *rows]))
+    for gap, level in ((0.4, ["fail"]), (4.0, [])):
+        words = (
+            f'spring_back = "b"\ngap_back = {{ value = {gap}, unit = "mm" }}\ndamping = "viscous"\nnoise = "white"\n'
+        )
+        entry = '\n[[experiment]]\nkind = "free_vibration"\nfile = "run.csv"\nstiffness = "linear"\ndrift = "none"\n'
+        (tmp_path / "rig.toml").write_text(HEAD + entry + words)
+        found = [one for one in fit(read_rig(tmp_path), budget=None).findings if one.code == "decays.contact"]
+        assert [one.level for one in found] == level
+        assert all(one.facts["reach"] < one.facts["gap"] < 0.0 for one in found)
+
+
+@pytest.mark.full
+def test_a_decay_of_the_capsule_model_meets_the_spring_behind_the_rod(tmp_path: Path) -> None:
+    x = simulate_general(TRUTH, (lambda t, on: 0.0, []), TIME, 1e-10, 1e-12, start=(-2e-3, 0.0, 0.0, 0.0))[0]
+    write(tmp_path, x, HARMONIC)
+    entry = '\n[[experiment]]\nkind = "free_vibration"\nfile = "run.csv"\nforward = "capsule"\ncapsule = "free"\n'
+    entry += 'start = { value = 0, unit = "s" }\nstop = { value = 0.6, unit = "s" }\n'
+    text = (tmp_path / "run.csv").read_text().splitlines()
+    (tmp_path / "run.csv").write_text("\n".join(line.rpartition(",")[0] for line in text))
+    (tmp_path / "rig.toml").write_text(HEAD + entry + SPRINGS)
+    (decay,) = make_experiments(read_rig(tmp_path))
+    names = {"k2[a]", "k2[b]", "G[run]", "G_back[run]"}
+    assert names <= {row.name for row in decay.parameters}
+    values = {**TRUTH, "x_start": -2e-3, "y_start": 0.0, "noise_sd": NOISE}
+    assert np.sqrt(np.mean(np.asarray(decay.residuals(values, np)) ** 2)) < 1.15
+    assert np.sqrt(np.mean(np.asarray(decay.residuals({**values, "k2_back": 5500.0}, np)) ** 2)) > 1.5

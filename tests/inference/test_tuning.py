@@ -130,7 +130,7 @@ def test_a_failed_draw_rules_a_setting_out_and_velocity_orders_equal_shares() ->
         ({"Omega": (0.0, 40.0)}, GAP, "Omega must be admissible"),
         ({"P_d": (1.0, 5.0), "duty": (0.1, 0.5)}, GAP, "the pulses drive has no P_d"),
         ({"P_on": (0.5, 1.0)}, {"duty": 1.5, "period": 0.1, **GAP}, "duty must lie between 0 and 1"),
-        ({"P_d": (1.0, 5.0)}, {"Omega": 34.56}, "tune needs G (gap between rod and support spring; negative"),
+        ({"P_d": (1.0, 5.0)}, {"Omega": 34.56}, "tune needs G (gap between rod and support spring where x_rel = 0"),
         ({"P_d": (1.0, 5.0)}, {"mass": 1.0}, "the harmonic drive has no mass"),
     ],
 )

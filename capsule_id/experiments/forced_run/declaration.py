@@ -368,7 +368,7 @@ TEMPLATE = """\
 # file = "run_01.csv"
 # spring = "L60"
 # gap = { value = 1.0, sd = 0.02, unit = "mm" }
-#: a spring behind the rod. A gap of either is negative where the spring is compressed with the rod at rest
+#: a spring behind the rod. A gap counts from x_rel = 0; it is negative where the spring reaches beyond
 # spring_back = "L60"
 # gap_back = { value = 2.0, sd = 0.02, unit = "mm" }
 # Omega = { value = 34.56, unit = "rad/s" }

@@ -116,9 +116,8 @@ def held_rod(theta: Mapping[str, float], P_d: float, Omega: float, G: float) -> 
 
     The rod starts from rest. A capsule at rest sticks while |f| <= F_b, so the test for its motion is exact.
     """
-    m1, k1, c, k2, k2_back = (float(theta.get(name, 0.0)) for name in ("m1", "k1", "c", "k2", "k2_back"))
-    behind = {"k2_back": k2_back, "G_back": float(theta.get("G_back", np.inf))}
-    capsule = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=G, **behind)
+    m1, k1, c, k2 = (float(theta.get(name, 0.0)) for name in ("m1", "k1", "c", "k2"))
+    capsule = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=G)
     held, e = without_absent(capsule, Excitation(P_d, Omega))
 
     def rate(t: float, state: np.ndarray) -> list[float]:
@@ -163,12 +162,12 @@ def lint_feasibility(table: Table, rig: Rig, estimate: Estimate) -> list[Finding
 def check_feasible(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
     """Check that the settings of every run allow it to determine its parameters, at the point fit."""
     findings = []
-    # The rule for contact and slip of a run from rest holds on level ground.
-    for run in (run for run in runs if not run.ground):
+    # The rule for contact and slip of a run from rest holds on level ground, with a spring in front of the rod.
+    for run in (run for run in runs if not run.ground and run.table.settings.spring_back is None):
         theta = run.local(fit.values)
         p, e = run.capsule(theta)
         F_b, P_d, G = (float(x) for x in (run.law(theta).forward(0.0), e.P_d, p.G))  # pyright: ignore
-        findings += feasibility(run.table, {**run.exact, **theta}, F_b, P_d, G)
+        findings += feasibility(run.table, theta, F_b, P_d, G)
     return findings
 
 
@@ -247,7 +246,7 @@ def _groups(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float]:
     p, e = run.capsule(theta)
     m1, m2, k1, k2, c, G = (float(leaf) for leaf in (p.m1, p.m2, p.k1, p.k2, p.c, p.G))  # pyright: ignore[reportArgumentType]
     Omega0, F_b = np.sqrt(k1 / m1), float(run.law(theta).forward(0.0))
-    length, of = F_b / k1, run.label
+    length, of, behind = F_b / k1, run.label, run.table.settings.spring_back
     scales = {"N": ("F_b", F_b), "m/s": ("(Omega0 F_b/k1)", Omega0 * length)}
     own = [(row.symbol, *scales[row.unit]) for row in run.friction.parameters if row.unit in scales]
     return {
@@ -258,6 +257,11 @@ def _groups(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float]:
         f"Omega/Omega0 [{of}]": run.Omega / Omega0,
         f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore
         **({f"k2/k1 [{run.spring}]": k2 / k1, f"G k1/F_b [{of}]": G / length} if run.spring is not None else {}),
+        **(
+            {f"k2/k1 [{behind}]": float(p.k2_back) / k1, f"G_back k1/F_b [{of}]": float(p.G_back) / length}  # pyright: ignore
+            if behind is not None
+            else {}
+        ),
     }
 
 
@@ -315,8 +319,9 @@ def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
     sides = column.values, np.asarray(run.motion(theta, np).x_rel) + offset
     try:
         step, fastest = sampling_step(run.time), PASS_BAND_MULTIPLE * dominant_frequency(run.time, sides[1])
-        if run.spring is not None and "m1" in theta:
-            fastest = max(fastest, float(np.sqrt((p.k1 + p.k2) / p.m1)) / (2.0 * np.pi))  # pyright: ignore[reportArgumentType]
+        if {run.spring, run.table.settings.spring_back} != {None} and "m1" in theta:
+            stiffest = p.k1 + np.maximum(p.k2, p.k2_back)  # pyright: ignore[reportArgumentType]
+            fastest = max(fastest, float(np.sqrt(stiffest / p.m1)) / (2.0 * np.pi))  # pyright: ignore[reportArgumentType]
         window = longest_window(fastest * step, len(run.time), FILTER_ORDER, SMALLEST_RATE_GAIN, derivative=1)
         recorded, fitted = (_filtered(run.time, side, window * step) for side in sides)
     except InputError:
@@ -438,9 +443,14 @@ class PulseRun(OtherRun):
         self.off = -1.0 if table.settings.drive == SQUARE else 0.0
 
     def starts(self) -> dict[str, Start]:
-        """A pulse begins half the duty before its tone is largest; its phase counts from the first sample."""
+        """A pulse begins half the duty, and the delay by its lag, before the force is largest.
+
+        Its phase counts from the first sample.
+        """
         starts, of = super().starts(), f"phase[{self.about.record}]"
-        turn = self.Omega * self.first + np.pi * (self.exact.get("duty", 0.5) + (self.table.settings.P_on.value < 0.0))
+        s = self.table.settings
+        turn = self.Omega * self.first + np.pi * (self.exact.get("duty", 0.5) + (s.P_on.value < 0.0))
+        turn += 0.0 if s.lag is None else np.arctan(self.Omega * s.lag.value)
         if of in starts:
             starts[of] = Start(float(np.angle(np.exp(1j * (starts[of].centre + turn)))), starts[of].spread)
         return starts

@@ -323,7 +323,11 @@ class CapsuleRun(CapsuleForward):
 
     def noise_facts(self) -> Facts:
         noise = "ar1" if self.coloured else self.table.settings.noise
-        return {**super().noise_facts(), "noise": noise, "spring": self.spring is not None}
+        return {
+            **super().noise_facts(),
+            "noise": noise,
+            "spring": {self.spring, self.table.settings.spring_back} != {None},
+        }
 
     def excess_noise(self, theta: ValuesBySymbol) -> float:
         # A record alone does not determine the level of coloured noise.

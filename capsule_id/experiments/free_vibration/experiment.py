@@ -119,7 +119,9 @@ def check_free_decay(records: Sequence[DecayRecord], fit: Fitted) -> list[Findin
             moved = side * (e.values - equilibrium(e.values))
             reach = float(np.max(moved)) if e.order == 0 else e.largest_deflection
             if gap is not None and reach >= gap.value:
-                findings.append(Finding("decays.contact", "fail", {"reach": reach, "gap": gap.value}, e.label))
+                findings.append(
+                    Finding("decays.contact", "fail", {"reach": side * reach, "gap": side * gap.value}, e.label)
+                )
     return findings
 
 

@@ -118,7 +118,7 @@ DRIVE_RULES = (
     ),
     DriveRule(("pulses",), lacks("duty"), "drive", _DUTY, "{columns}", "add the column duty"),
     DriveRule(("harmonic",), present("duty"), "drive", _DUTY, "{columns}", "remove the column duty"),
-    DriveRule(("harmonic",), stated("lag"), "lag", "only pulses have a lag", "lag", "remove lag", of_key=True),
+    DriveRule(("harmonic",), stated("lag"), "lag", "a harmonic drive has no lag", "lag", "remove lag", of_key=True),
     *(
         DriveRule(
             (drive,), _amplitudes, "",
@@ -161,8 +161,9 @@ def _lint_settings(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 
 TEMPLATE = """\
 #: Progression, a row per trial: the displacement of the capsule after a number of drive periods from rest. Columns:
-#: period [ms] or f [Hz]; periods [1]; distance [cm]; duty [%] with pulses; session [1] optional. The amplitude is a
-#: column P_on [N] (harmonic: P_d [N]) or current [A], or a setting with its prior. It may be negative. lag too.
+#: period [ms] or f [Hz]; periods [1]; distance [cm]; duty [%] with pulses, and optionally a square wave; session [1]
+#: optional. The amplitude is a column P_on [N] (harmonic: P_d [N]) or current [A], or a setting with its prior. It may be
+#: negative. lag too.
 #: Without a column session every block of consecutive rows with equal settings is a session.
 # [[experiment]]
 # kind = "progression"

@@ -295,7 +295,7 @@ def initial_lanes(
 
     def without_rounding(contact: Force) -> jax.Array:
         d = contact.side * (X1 - X2) - contact.reach
-        allowed = rounding + 2.0 * jnp.finfo(float).eps * contact.reach
+        allowed = rounding + 2.0 * jnp.finfo(float).eps * jnp.abs(contact.reach)
         return jnp.where(jnp.abs(d) <= allowed, d - stop_gradient(d), d)
 
     gaps = tuple(map(without_rounding, constants.contacts))
