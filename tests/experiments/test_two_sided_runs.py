@@ -195,7 +195,7 @@ def test_a_fit_finds_both_springs_and_gaps(tmp_path: Path) -> None:
     assert result["k2[b]"].sd < 0.02 * TRUTH["k2_back"]
     behind = "".join(line for line in SPRINGS.splitlines(keepends=True) if "_back" not in line)
     (tmp_path / "rig.toml").write_text(HEAD + RUN + HARMONIC + behind + entries)
-    assert not fit(read_rig(tmp_path), budget=None).verdict.clean
+    assert not fit(read_rig(tmp_path), budget=None).clean
 
 
 def square(q: Values, times: np.ndarray, begin: float = 0.0) -> np.ndarray:
