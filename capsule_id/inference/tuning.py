@@ -253,13 +253,14 @@ def _leaves(
     progressions = [table.settings for table in rig.tables if isinstance(table.settings, ProgressionSettings)]
     stated += [(name, getattr(own, name)) for own in progressions for name in (AMPLITUDE[drive], "lag")]
     values |= {name: quantity.value for name, quantity in stated if quantity is not None}
-    if len({(run.spring_back, run.gap_back) for run in runs}) > 1 and "k2_back" not in {*given, *searched}:
+    differ = len({(run.spring_back, run.gap_back) for run in runs}) > 1
+    if differ and given.get("k2_back") != 0.0 and not {"k2_back", "G_back"} <= {*given, *searched}:
         rule = "tune needs k2_back and G_back where the runs do not have the same spring behind the rod"
         raise InputError(rule, "none", "give both, in N/m and m; k2_back = 0: none")
     square = any(getattr(table.settings, "drive", "") == "square" for table in rig.tables)
     if drive == "pulses" and square and "P_off" not in {*given, *searched}:
         raise InputError("tune needs P_off after a fit of a square wave", "none", "give -P_on, or 0 for pulses")
-    values |= _behind(runs[0], chosen) if runs else {}
+    values |= {"k2_back": 0.0, "G_back": np.inf} if differ else _behind(runs[0], chosen) if runs else {}
     values |= {**result.fixed, **chosen} | ({} if spring is None else {"k2": springs[spring]}) | dict(given)
     needed = {name for name in own if LEAVES[name].default is None} - searched
     for name in sorted(needed):

@@ -11,14 +11,17 @@ import pytest
 from capsule_id.api import fit, read_rig
 from capsule_id.commands.bifurcate import overlay
 from capsule_id.errors import InputError
+from capsule_id.experiments.forced_run.drives import _portrait
 from capsule_id.experiments.forced_run.experiment import CapsuleRun
 from capsule_id.experiments.kind import make_experiments
+from capsule_id.inference import tuning
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.target import LogPosterior
 from capsule_id.inference.tuning import operating_points, tune
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.physics.simulation import simulate
+from capsule_id.records.motion import measured_motion
 from tests.experiments.test_foreign_law import Hertz
 from tests.inference.test_tuning import fit_of
 from tests.rig.faults import fault_of
@@ -266,7 +269,9 @@ def test_a_contact_of_ones_own_stands_in_front_of_the_rod(tmp_path: Path) -> Non
         make_experiments(read_rig(tmp_path, contact=Hertz), contact=Hertz)
 
 
-def test_runs_with_a_spring_behind_the_rod_are_tuned_and_drawn_with_it_or_not_at_all(tmp_path: Path) -> None:
+def test_runs_with_a_spring_behind_the_rod_are_tuned_and_drawn_with_it_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS)
     rig, chosen = read_rig(tmp_path), {"k2[a]": np.array([9e3, 9.1e3]), "k2[b]": np.array([5e3, 5.1e3])}
     ((_, settings, _),) = operating_points(fit_of({}, rig=rig), chosen, "harmonic")
@@ -278,10 +283,44 @@ def test_runs_with_a_spring_behind_the_rod_are_tuned_and_drawn_with_it_or_not_at
     values = {"k1": 1420.0, "c": 3.9, "mu": 0.3, "v_s": 0.3, "k2[a]": 9e3, "k2[b]": 5e3}
     with pytest.raises(InputError, match="do not have the same spring behind the rod"):
         tune(fit_of(values, rig=other), {"P_d": (4.0, 8.0)}, {"Omega": 60.0, "G": 1e-3}, spring="a")
+    # The remedy works, and each operating point has the spring behind the rod that it had when it was measured.
+    asked = list[dict[str, np.ndarray]]()
+    monkeypatch.setattr(
+        tuning._Model, "velocity", lambda model, settings, how: asked.append(settings) or np.zeros((3, 2))
+    )
+    many = {**chosen, **{name: np.full(2, x) for name, x in values.items() if name not in chosen}}
+    leaves = tuning._leaves(
+        fit_of(values, rig=other), many, "harmonic", {"P_d"}, {"k2_back": 0.0, "Omega": 60.0, "G": 1e-3}, "a"
+    )
+    points = operating_points(fit_of(values, rig=other), many, "harmonic")
+    table = tuning._table(tuning._Model(leaves, "harmonic", 2), {"P_d": 5.0}, points, None, "trusted")
+    assert list(table["k2_back [N/m]"]) == [0.0, 5050.0, 0.0]
+    assert list(table["G_back [m]"]) == [np.inf, 8e-4, np.inf]
+    np.testing.assert_array_equal(asked[0]["k2_back"][1], chosen["k2[b]"])
     write(tmp_path, np.zeros((len(TIME), 4)), SQUARE + SPRINGS)
     with pytest.raises(InputError, match="tune needs P_off"):
         tune(fit_of(values, rig=read_rig(tmp_path)), {"P_on": (4.0, 8.0)}, {"period": 0.1, "duty": 0.5, "G": 1e-3})
     assert "no harmonic force" in overlay(read_rig(tmp_path), "Omega", (20.0, 90.0), {**TRUTH, "P_d": 8.0}, chosen)[1]
+
+
+def test_a_rod_that_never_leaves_a_compressed_spring_has_no_count_of_contacts(tmp_path: Path) -> None:
+    """The model counts closings, 0; one stretch of contact in each period is none. Control: a gap that opens."""
+    x = np.zeros((len(TIME), 4))
+    x[:, 0] = 1e-3 * np.cos(OMEGA * TIME)
+    for gap, said in ((-3.0, True), (0.5, False)):
+        write(tmp_path, x, HARMONIC + SPRINGS.replace("value = -0.2", f"value = {gap}"))
+        motion = measured_motion(read_rig(tmp_path).tables[0])
+        assert ("contacts: the rod does not leave the spring" in motion.evidence.reasons) == said
+        assert (motion.evidence.contacts.count is None) == said
+
+
+def test_the_portrait_has_a_line_for_each_spring(tmp_path: Path) -> None:
+    write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS)
+    start = {"x_start": 0.0, "y_start": 0.0, "noise_x_rel": NOISE, "noise_x_capsule": NOISE, "phase": PHASE, "P_d": P_D}
+    (panel,) = _portrait(run_of(tmp_path), {**TRUTH, **start})
+    places = {curve.label: float(curve.x[0]) for curve in panel.curves[1:]}
+    # In the unit of the column; the offset of the sensor is near 0.
+    assert places == pytest.approx({"support spring a": -2e-4, "back spring b": -8e-4}, abs=2e-5)
 
 
 def test_a_free_decay_that_reaches_the_spring_behind_the_rod_fails(tmp_path: Path) -> None:
