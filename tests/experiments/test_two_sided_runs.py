@@ -11,7 +11,7 @@ import pytest
 from capsule_id.api import fit, read_rig
 from capsule_id.commands.bifurcate import overlay
 from capsule_id.errors import InputError
-from capsule_id.experiments.forced_run.drives import _portrait
+from capsule_id.experiments.forced_run.drives import _groups, _portrait
 from capsule_id.experiments.forced_run.experiment import CapsuleRun
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference import tuning
@@ -321,6 +321,28 @@ def test_the_portrait_has_a_line_for_each_spring(tmp_path: Path) -> None:
     places = {curve.label: float(curve.x[0]) for curve in panel.curves[1:]}
     # In the unit of the column; the offset of the sensor is near 0.
     assert places == pytest.approx({"support spring a": -2e-4, "back spring b": -8e-4}, abs=2e-5)
+
+
+def test_the_groups_of_a_run_hold_those_of_the_spring_behind_the_rod(tmp_path: Path) -> None:
+    write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS)
+    found = _groups(run_of(tmp_path), {**TRUTH, "phase": PHASE, "P_d": P_D})
+    assert (found["k2/k1 [a]"], found["k2/k1 [b]"]) == pytest.approx((9000 / 1420, 5000 / 1420))
+    F_b = TRUTH["mu"] * (TRUTH["m1"] + TRUTH["m2"]) * TRUTH["g"]
+    assert found["G_back k1/F_b [run]"] == pytest.approx(8e-4 * 1420 / F_b)
+
+
+def test_a_square_wave_is_the_pulse_and_its_opposite_for_equal_times(tmp_path: Path) -> None:
+    """Where no duty is stated; of a run and of a progression, whose pulses are on all the time without one."""
+    write(tmp_path, np.zeros((len(TIME), 4)), SQUARE + SPRINGS)
+    drive = run_of(tmp_path).capsule({**TRUTH, "P_on": 6.0, "phase": 0.3, "lag": LAG})[1]
+    assert (drive.P_on, drive.P_off, drive.duty, drive.lag) == (6.0, -6.0, 0.5, LAG)
+    (tmp_path / "progression.csv").write_text("period [ms],periods [1],distance [m]\n60,10,0.01\n90,10,0.02\n")
+    entry = '\n[[experiment]]\nkind = "progression"\nfile = "progression.csv"\ndrive = "square"\n'
+    (tmp_path / "rig.toml").write_text(HEAD + entry + 'P_on = { value = 6, unit = "N" }\n')
+    (trials,) = make_experiments(read_rig(tmp_path))
+    drive = trials.capsule(TRUTH, trials.settings)[1]
+    np.testing.assert_array_equal(drive.duty, 0.5)
+    np.testing.assert_array_equal(drive.P_off, -drive.P_on)
 
 
 def test_a_free_decay_that_reaches_the_spring_behind_the_rod_fails(tmp_path: Path) -> None:

@@ -330,7 +330,8 @@ def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
     stops = (run.spring, "support spring", p.G), (run.table.settings.spring_back, "back spring", -p.G_back)
     for name, of, stop in (one for one in stops if one[0] is not None):
         place = np.full(2, (float(stop) + offset) * unit)  # pyright: ignore[reportArgumentType]
-        curves.append(Curve(f"{of} {name}", place, np.array([fitted[1].min(), fitted[1].max()]), role="paper"))
+        ends, role = np.array([fitted[1].min(), fitted[1].max()]), "paper" if of == "support spring" else "alternative"
+        curves.append(Curve(f"{of} {name}", place, ends, role=role))
     label, points = f"{run.label}_phase_portrait", Points("record", recorded[0] * unit, recorded[1])
     axes = axis_label(column), "rate of x_rel, m/s"
     return [Comparison("phase_portrait", label, f"{run.label}: phase portrait", *axes, (points,), tuple(curves))]
