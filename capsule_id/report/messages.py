@@ -563,6 +563,14 @@ def _tables_disagree(facts: Facts) -> str:
     )
 
 
+#: How to fit F0 + mu N.
+_CONSTANT_FORCE = (
+    " Where a constant force F0 acts besides (a load cell that reads F0 without load, surfaces that stick), F0 + mu N is "
+    'fitted by force_instrument = "cell" in the entry, and [[instrument]], name = "cell", offset = {{ value = 0, sd = '
+    '{:g}, unit = "N" }} on lines of their own; mu is then the slope.'
+)
+
+
 def _loads_differ(facts: Facts) -> str:
     """The coefficient at the loads, the lowest and the highest where there are many."""
     means = facts["means"]
@@ -572,6 +580,7 @@ def _loads_differ(facts: Facts) -> str:
         f"expected friction in proportion to the normal force; found a coefficient of {values} ({stated_p(facts['p'])}). One "
         "coefficient does not hold for all loads. Fit the rows of similar loads in a folder of their own, and use the load "
         "that is nearest to the weight of the capsule. Where the speed changes with the load, look first at the friction law."
+        + ("" if facts["instrument"] else _CONSTANT_FORCE.format(float(f"{max(x * y for x, y in means):.0g}")))
     )
 
 

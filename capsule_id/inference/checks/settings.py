@@ -298,7 +298,7 @@ def _of_loads(s: SampledFit, e: Experiment, p: float) -> Facts:
     if len(residuals) >= FEWEST_ROWS:
         levels = _of_levels(at_each_load(residuals, load))
         p = 3.0 * min(p, levels, trend(_standardised(residuals, load), load))
-    return {"means": means, "p": p}
+    return {"means": means, "p": p, "instrument": e.table.columns["force"].instrument is not None}
 
 
 def at_each_load(values: np.ndarray, load: np.ndarray) -> list[np.ndarray]:
