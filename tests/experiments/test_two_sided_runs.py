@@ -11,6 +11,7 @@ import pytest
 from capsule_id.api import fit, read_rig
 from capsule_id.commands.bifurcate import overlay
 from capsule_id.errors import InputError
+from capsule_id.experiments.capsule_experiment import stated_parameters
 from capsule_id.experiments.forced_run.drives import _groups, _portrait
 from capsule_id.experiments.forced_run.experiment import CapsuleRun
 from capsule_id.experiments.kind import make_experiments
@@ -22,6 +23,7 @@ from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.physics.simulation import simulate
 from capsule_id.records.motion import measured_motion
+from capsule_id.rig.model import Quantity
 from tests.experiments.test_foreign_law import Hertz
 from tests.inference.test_tuning import fit_of
 from tests.rig.faults import fault_of
@@ -269,6 +271,17 @@ def test_a_contact_of_ones_own_stands_in_front_of_the_rod(tmp_path: Path) -> Non
         make_experiments(read_rig(tmp_path, contact=Hertz), contact=Hertz)
 
 
+def test_a_gap_within_four_sd_of_0_may_be_negative() -> None:
+    for symbol in ("G", "G_back"):
+        for value, kind in ((1.9e-4, "normal"), (2.1e-4, "positive_normal"), (-2e-4, "normal")):
+            (row,) = stated_parameters(symbol, Quantity(value, 5e-5))
+            assert row.prior is not None
+            assert row.prior.kind == kind
+    (row,) = stated_parameters("P_d", Quantity(1.9, 0.5))
+    assert row.prior is not None
+    assert row.prior.kind == "positive_normal"
+
+
 def test_runs_with_a_spring_behind_the_rod_are_tuned_and_drawn_with_it_or_not_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -297,6 +310,15 @@ def test_runs_with_a_spring_behind_the_rod_are_tuned_and_drawn_with_it_or_not_at
     assert list(table["k2_back [N/m]"]) == [0.0, 5050.0, 0.0]
     assert list(table["G_back [m]"]) == [np.inf, 8e-4, np.inf]
     np.testing.assert_array_equal(asked[0]["k2_back"][1], chosen["k2[b]"])
+    # Which spring stands in front: a alone, and a where it stands on both sides.
+    given = {"Omega": 60.0, "G": 1e-3}
+    both = replace(rig.tables[0], settings=replace(rig.tables[0].settings, spring_back="a"))
+    for tables, back in ((rig.tables, "b"), ((both,), "a")):
+        own_rig = replace(rig, tables=tables)
+        found = tuning._leaves(fit_of(values, rig=own_rig), {**many}, "harmonic", {"P_d"}, given, None)
+        assert found["k2"] is many["k2[a]"]
+        assert found["k2_back"] is many[f"k2[{back}]"]
+        many.pop("k2[b]", None)
     write(tmp_path, np.zeros((len(TIME), 4)), SQUARE + SPRINGS)
     with pytest.raises(InputError, match="tune needs P_off"):
         tune(fit_of(values, rig=read_rig(tmp_path)), {"P_on": (4.0, 8.0)}, {"period": 0.1, "duty": 0.5, "G": 1e-3})
