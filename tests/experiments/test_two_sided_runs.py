@@ -336,6 +336,21 @@ def test_a_rod_that_never_leaves_a_compressed_spring_has_no_count_of_contacts(tm
         assert (motion.evidence.contacts.count is None) == said
 
 
+def test_the_acceleration_counts_contacts_where_no_spring_stands_behind_the_rod(tmp_path: Path) -> None:
+    x = np.zeros((len(TIME), 4))
+    x[:, 0] = 1e-3 * np.cos(OMEGA * TIME)
+    gap = SPRINGS.replace("value = -0.2", "value = 0.9")
+    for springs, counted in ((gap, False), (gap.partition("spring_back")[0], True)):
+        write(tmp_path, x, HARMONIC + springs)
+        table = read_rig(tmp_path).tables[0]
+        noise = np.random.default_rng(2).standard_normal(len(TIME))
+        column = replace(table.columns["x_rel"], name="acceleration_rod", values=noise - OMEGA**2 * x[:, 0])
+        table = replace(table, columns={**table.columns, "acceleration_rod": column})
+        contacts = measured_motion(table).evidence.contacts
+        assert contacts is not None
+        assert bool(contacts.spikes) == counted
+
+
 def test_the_portrait_has_a_line_for_each_spring(tmp_path: Path) -> None:
     write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS)
     start = {"x_start": 0.0, "y_start": 0.0, "noise_x_rel": NOISE, "noise_x_capsule": NOISE, "phase": PHASE, "P_d": P_D}
