@@ -39,8 +39,8 @@ from capsule_id.rig.schema import GroundSettings, QuantityRule
 from capsule_id.synthetic import PAPER, Truth, synthesize
 from capsule_id.views import counted
 
-#: Draws at which the information is computed, and the time for the tests, min.
-DRAWS, MINUTES = 8, 30.0
+#: Draws at which the information is computed, the time for the tests, min, and the largest planned number of one test.
+DRAWS, MINUTES, MOST_TESTS = 8, 30.0, 1000
 #: Step of the differences of the residuals, natural-log units or parts of a prior's sd.
 STEP = 1e-4
 #: Most rows of a table whose information is computed; more tests multiply it.
@@ -506,8 +506,8 @@ def planned(folder: str | Path, registry: Registry, draws: int = DRAWS, seed: in
 def _planned_tests(rig: Rig, known: Sequence[str]) -> Mapping[str, float]:
     """Numbers of tests by the ``known`` words, from [plan]."""
     place, tests = rig.folder / "rig.toml", rig.plan.get("tests", {})
-    if wrong := [word for word, number in tests.items() if word not in known or number != int(number)]:
-        rule = "[plan] tests must be whole numbers of bench tests that the synthetic rig has"
+    if wrong := [word for word, n in tests.items() if word not in known or n % 1.0 or n > MOST_TESTS]:
+        rule = f"[plan] tests must be whole numbers up to {MOST_TESTS} of bench tests that the synthetic rig has"
         raise InputError(rule, f"{wrong[0]} = {tests[wrong[0]]:g}", f"choose from {', '.join(known)}", place)
     lines = {f'[rig] {name} = {{ value = 0.1, unit = "kg" }}': getattr(rig, name) for name in ("m1", "m2")}
     lines |= {"[plan] tests = { push = 10, free_vibration = 3 }": tests}

@@ -267,8 +267,9 @@ def test_the_lines_name_the_instrument(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("plan", "rule"),
     [
-        ("tests = { run = 2 }", "must be whole numbers of bench tests that the synthetic rig has, run = 2"),
-        ("tests = { push = 0.5 }", "must be whole numbers of bench tests"),
+        ("tests = { run = 2 }", "must be whole numbers up to 1000 of bench tests that the synthetic rig has, run = 2"),
+        ("tests = { push = 0.5 }", "must be whole numbers"),
+        ("tests = { push = 1e9 }", "must be whole numbers up to 1000"),
         ("minutes = { push = 2 }", r"no tests, add e\.g\. tests = \{ push = 10, free_vibration = 3 \} to \[plan\]"),
         ("tests = { psh = 2 }", "unknown key"),
         ("tests = { push = -2 }", "push of tests must be greater than 0"),
