@@ -98,9 +98,8 @@ def test_a_large_release_biases_the_closed_form_only() -> None:
     assert abs(closed - bench.C) > 5.0 * sd
 
 
-@pytest.mark.parametrize(
-    ("release", "doubted"), [(6e-3, {"c", "c_q", "k_cubic"}), pytest.param(2e-3, set(), marks=pytest.mark.full)]
-)
+@pytest.mark.full
+@pytest.mark.parametrize(("release", "doubted"), [(6e-3, {"c", "c_q", "k_cubic"}), (2e-3, set())])
 def test_a_slip_that_looks_like_a_further_force_is_named(release: float, doubted: set[str]) -> None:
     """The capsule counts as held, and tilts give mu. (Before: c 6 sd off, and a quadratic damping, both trusted.)"""
     table = decay(release, "closed")

@@ -1,7 +1,8 @@
-"""What the fitted model of a decay lacks: further forces, a c that changes, a hold before the release, jumps of the zero."""
+"""What the fitted model of a decay lacks: further forces, changes with time, a hold before the release, jumps of the zero."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -308,47 +309,54 @@ def reduced(e: Decay, theta: Mapping[str, float], beside: bool = True) -> tuple[
     return known / noise, others / noise, residuals[:, 0] / noise
 
 
-# changing damping: A c that changes linearly with time, as of a damper that warms up.
+# changes: A c or a k1 that changes linearly with time, as of a damper or a spring that warms up.
 #
 # A c that grows damps small motions more than large ones, as dry friction does; one that falls, as quadratic damping
-# does. The comparison is by BIC at the maxima of both models.
+# does. A k1 that changes shifts the frequency with the amplitude, as a cubic spring does. The comparison is by BIC at the
+# maxima of both models.
 
 
 #: Smallest omega^2 of a decay whose c changes, relative to k1/m1: its frequency stays real.
 SMALLEST_SQUARE = 0.01
+#: What may change with time, and the setting whose words exclude it.
+CHANGING = {"c": "damping", "k1": "stiffness"}
 #: Points of the Gauss rule for the phase: exact up to rounding for a c that grows by 40 %, up to a damping ratio of 0.5.
 PHASE_POINTS = 12
-#: Bounds of the logarithms of k1 and c from their fitted values, and of the growth of c relative to its value in the middle.
+#: Bounds of the logarithms of k1 and c from their fitted values, and of the growth relative to the value in the middle.
 WIDEST_CHANGE = (0.1, 1.0, 1.9)
 
 
 def changing_motions(
-    time: np.ndarray, theta: Mapping[str, float], growth: float, length: float, order: int
+    time: np.ndarray, theta: Mapping[str, float], growth: Mapping[str, float], length: float, order: int
 ) -> np.ndarray:
-    """(n, 2) decays, or their derivatives of this ``order``, whose c grows by ``growth`` times ``theta["c"]`` in ``length`` s.
+    """(n, 2) decays, or their derivatives of this ``order``, whose c or k1 has this relative ``growth`` in ``length`` s.
 
-    c is reached at half that time. With x = exp(-int gamma) y, y'' + (omega_0^2 - gamma^2 - gamma') y = 0 has no damping.
-    Its frequency changes slowly, so y is its phase's cosine and sine over the root of the frequency (Liouville and Green).
+    ``theta`` holds the values at half that time. With x = exp(-int gamma) y, y'' + (omega_0^2 - gamma^2 - gamma') y = 0 has
+    no damping. Its frequency changes slowly, so y is its phase's cosine and sine over the root of the frequency (Liouville
+    and Green).
     """
     middle, square = theta["c"] / (2.0 * theta["m1"]), theta["k1"] / theta["m1"]
-    rate = middle * growth / length
+    rate, stiffening = middle * growth.get("c", 0.0) / length, square * growth.get("k1", 0.0) / length
     points, weights = np.polynomial.legendre.leggauss(PHASE_POINTS)
 
     def gamma(t: np.ndarray) -> np.ndarray:
         return middle + rate * (t - 0.5 * length)
 
+    def spring(t: np.ndarray) -> np.ndarray:
+        return square + stiffening * (t - 0.5 * length)
+
     def omega(t: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(square - gamma(t) ** 2 - rate, SMALLEST_SQUARE * square))
+        return np.sqrt(np.maximum(spring(t) - gamma(t) ** 2 - rate, SMALLEST_SQUARE * square))
 
     own, phase = omega(time), 0.5 * time * (omega(0.5 * time[:, None] * (1.0 + points)) @ weights)
     x = np.exp(-time * gamma(0.5 * time) + 1j * phase) / np.sqrt(own)
-    velocity = x * (-gamma(time) + 1j * own + 0.5 * gamma(time) * rate / own**2)
-    found = (x, velocity, -2.0 * gamma(time) * velocity - square * x)[order]
+    velocity = x * (-gamma(time) + 1j * own + (0.5 * gamma(time) * rate - 0.25 * stiffening) / own**2)
+    found = (x, velocity, -2.0 * gamma(time) * velocity - spring(time) * x)[order]
     return np.stack([found.real, found.imag], axis=1)
 
 
-def left_by(e: DecayRecord, theta: Mapping[str, float], growth: float | None = None) -> np.ndarray:
-    """Whitened residuals (n,) beside the linear nuisances; of viscous damping that grows, where ``growth`` is stated."""
+def left_by(e: DecayRecord, theta: Mapping[str, float], growth: Mapping[str, float] | None = None) -> np.ndarray:
+    """Whitened residuals (n,) beside the linear nuisances; of a viscous decay whose c or k1 has this ``growth``, if any."""
     raw, design = e.unwhitened(theta, np)
     if growth is not None:
         nodes = np.ravel(e.nodes) * stretch(e.clock_rate, theta)
@@ -358,33 +366,31 @@ def left_by(e: DecayRecord, theta: Mapping[str, float], growth: float | None = N
 
 
 def check_changing(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
-    """Check that c does not change with time where that explains the decays about as well as their model, or better.
+    """Check that c and k1 do not change with time where that explains the decays about as well as their model, or better.
 
-    Stated damping counts as known, until c that changes is ``FACTOR`` times as probable.
+    Stated words count as known, until the change is ``FACTOR`` times as probable.
     """
     groups, findings = dict[Any, list[DecayRecord]](), list[Finding]()
     for e in records:
         if fit.values["c"] < 2.0 * STRONGEST * np.sqrt(fit.values["k1"] * e.mass):
-            groups.setdefault((e.model.symbols, e.table.settings.damping), []).append(e)
-    for (symbols, stated), members in groups.items():
-        facts = changing(members, fit.values)
+            stated = {symbol: getattr(e.table.settings, key) for symbol, key in CHANGING.items()}
+            groups.setdefault((e.model.symbols, *stated.items()), []).append(e)
+    for ((symbols, *stated), members), symbol in product(groups.items(), CHANGING):
+        facts = changing(members, fit.values, symbol)
         decided = facts["factor"] > FACTOR
         # A viscous decay is the case without growth: chance alone often gives a little.
         shown = bool(symbols) or facts["p"] < LEVEL
-        if facts["shift"] > DOUBTFUL and (decided or (shown and stated is None)):
-            facts |= {
-                "decided": decided,
-                "limit": FACTOR,
-                "symbols": symbols,
-                "damping": members[0].model.lines("damping"),
-            }
+        if facts["shift"] > DOUBTFUL and (decided or (shown and dict(stated)[symbol] is None)):
+            words = members[0].model.lines(CHANGING[symbol])
+            facts |= {"decided": decided, "limit": FACTOR, "symbols": symbols, "words": words}
             labels = [e.label for e in members]
-            findings.append(Finding("decays.changing", "warn", {**facts, "labels": labels}, labels[0], ("c", *symbols)))
+            names = (symbol, *symbols)
+            findings.append(Finding("decays.changing", "warn", {**facts, "labels": labels}, labels[0], names))
     return findings
 
 
-def changing(members: Sequence[DecayRecord], values: Mapping[str, float]) -> dict[str, Any]:
-    """Compare the quoted model with viscous damping whose c changes with time, for records of one model."""
+def changing(members: Sequence[DecayRecord], values: Mapping[str, float], symbol: str) -> dict[str, Any]:
+    """Compare the quoted model with a viscous decay whose c or k1, ``symbol``, changes with time, for records of one model."""
     thetas = [e.local(values) for e in members]
     rms = [float(np.sqrt(np.mean(left_by(e, theta) ** 2))) for e, theta in zip(members, thetas, strict=True)]
     # Rounding errors of records without noise decide nothing.
@@ -394,7 +400,7 @@ def changing(members: Sequence[DecayRecord], values: Mapping[str, float]) -> dic
     def left(z: np.ndarray) -> np.ndarray:
         moved = {"k1": values["k1"] * np.exp(z[0]), "c": values["c"] * np.exp(z[1])}
         parts = zip(members, thetas, noise, strict=True)
-        return np.concatenate([left_by(e, {**theta, **moved}, z[2]) / sd for e, theta, sd in parts])
+        return np.concatenate([left_by(e, {**theta, **moved}, {symbol: z[2]}) / sd for e, theta, sd in parts])
 
     widest = np.array(WIDEST_CHANGE)
     found = least_squares(left, np.zeros(3), bounds=(-widest, widest), x_scale="jac")
@@ -405,17 +411,19 @@ def changing(members: Sequence[DecayRecord], values: Mapping[str, float]) -> dic
     weight = special.expit(0.5 * (gain + (len(symbols) - 1) * np.log(ends[-1])))
     known = np.concatenate([reduced(e, theta, beside=False)[0] for e, theta in zip(members, thetas, strict=True)])
     relative = 0.0 if rig.m1 is None else rig.m1.sd / rig.m1.value
-    sd = np.hypot(np.linalg.norm(inverse_of(known)[1]), values["c"] * relative)
-    c = float(values["c"] * np.exp(found.x[1]))
+    place = ("k1", "c").index(symbol)
+    sd = np.hypot(np.linalg.norm(inverse_of(known)[place]), values[symbol] * relative)
+    middle = float(values[symbol] * np.exp(found.x[place]))
     return {
+        "symbol": symbol,
         "growth": float(found.x[2]),
         "error": float(np.linalg.norm(inverse_of(found.jac)[2])),
-        "c": c,
-        "value": values["c"],
+        "middle": middle,
+        "value": values[symbol],
         "model": members[0].model.name,
         "factor": float(weight / max(1.0 - weight, np.finfo(float).tiny)),
         "p": float(stats.chi2.sf(gain, 1)),
-        "shift": float(weight * abs(c - values["c"]) / sd),
+        "shift": float(weight * abs(middle - values[symbol]) / sd),
     }
 
 

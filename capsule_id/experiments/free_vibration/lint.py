@@ -526,24 +526,26 @@ def _hidden(facts: Facts) -> str:
 
 
 def _changing(facts: Facts) -> str:
-    """How c would change with time, how probable that is, and remedies."""
-    names = f"{' and '.join(('c', *facts['symbols']))} {'are' if facts['symbols'] else 'is'}"
+    """How c or k1 would change with time, how probable that is, and remedies."""
+    symbol = facts["symbol"]
+    unit, part = {"c": ("N s/m", "damper"), "k1": ("N/m", "spring")}[symbol]
+    names = f"{' and '.join((symbol, *facts['symbols']))} {'are' if facts['symbols'] else 'is'}"
     factor = f"more than {facts['limit']:.0f}" if facts["decided"] else f"{facts['factor']:.2g}"
     found = (
-        f"A c that {'grows' if facts['growth'] > 0.0 else 'falls'} by {100.0 * abs(facts['growth']):.0f} ± "
-        f"{100.0 * facts['error']:.1f} % within the record is {factor} times as probable as {facts['model']}. c is then "
-        f"{facts['c']:.4g} N s/m in the middle of the record (the fit: {facts['value']:.4g}), so {names} not judged."
+        f"A {symbol} that {'grows' if facts['growth'] > 0.0 else 'falls'} by {100.0 * abs(facts['growth']):.0f} ± "
+        f"{100.0 * facts['error']:.1f} % within the record is {factor} times as probable as {facts['model']}. {symbol} is "
+        f"then {facts['middle']:.5g} {unit} in the middle of the record (the fit: {facts['value']:.5g}), so {names} not judged."
     )
     if facts["decided"]:
         return (
-            f"{listed(facts['labels'])}: c changes with time, as of a damper that warms up. {found} No fit corrects it. Let "
-            "the rig reach a steady temperature, and record again."
+            f"{listed(facts['labels'])}: {symbol} changes with time, as of a {part} that warms up. {found} No fit corrects "
+            "it. Let the rig reach a steady temperature, and record again."
         )
-    effects = " or ".join(EFFECTS[symbol] for symbol in facts["symbols"]) or "a constant c"
+    effects = " or ".join(EFFECTS[symbol] for symbol in facts["symbols"]) or f"a constant {symbol}"
     return (
-        f"{listed(facts['labels'])}: expected records that tell {effects} from a c that changes with time; they do not. "
+        f"{listed(facts['labels'])}: expected records that tell {effects} from a {symbol} that changes with time; they do not. "
         f"{found} Add records of 3 times this amplitude: a force changes its effect with the amplitude, a change with time "
-        f"does not. Where another measurement excludes a change with time, write {facts['damping']} in the experiment."
+        f"does not. Where another measurement excludes a change with time, write {facts['words']} in the experiment."
     )
 
 
@@ -563,7 +565,7 @@ MESSAGES = {
         warn=_hidden,
         fail=_hidden,
     ),
-    "decays.changing": Message("damping against time", on_console=True, warn=_changing),
+    "decays.changing": Message("damping and stiffness against time", on_console=True, warn=_changing),
     "decays.held": Message(
         "release of a decay",
         ok="{labels}: k1 and c do not depend on the instant of the release",

@@ -59,11 +59,11 @@ KNOWN = ("k1", "c", "mu", "v_s", "K", "k2[stiff]")
 def fitted(
     engine: Literal["exact", "smooth"] = "exact", widths: Smoothing | None = None
 ) -> tuple[LogPosterior, PointFit]:
-    """One second of the second run, beside priors as wide as a bench leaves them, started 1 % off.
+    """Half a second of the second run, beside priors as wide as a bench leaves them, started 1 % off.
 
     ``widths`` : of the smoothed engine, where they are not the certified ones
     """
-    own = table(1, samples=1000)
+    own = table(1, samples=500)
     priors = {name: Prior("lognormal", TRUTH[name], 1.04) for name in KNOWN}
     rig = bench.rig(own, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
     rig = replace(rig, model=ModelChoices(engine=engine))
