@@ -57,6 +57,23 @@ def largest_residual(run: CapsuleRun, own: dict[str, float]) -> float:
     return max(float(np.sqrt(np.mean(residuals**2))) for _, residuals in records)
 
 
+def test_an_accelerometer_sees_the_force_that_moves_the_rod(tmp_path: Path) -> None:
+    """Before: the acceleration was that of pulses at another time, off by twice its rms; x_rel and x_capsule were right."""
+    drive, shift = Pulses(6.0, PERIOD, DUTY, phase=PHASE, lag=LAG), 50 * PERIOD
+    write(tmp_path, drive, shift, None, PULSES)
+    columns = np.loadtxt(tmp_path / "run.csv", delimiter=",", skiprows=1)
+    t = simulate(P, drive, shift + np.linspace(0.0, TIME[-1], 20 * (len(TIME) - 1) + 1))
+    # From the velocities on both sides of each sample, where no pulse begins or ends between them.
+    seen = np.gradient(np.asarray(t.Y1), np.asarray(t.times))[::20]
+    rows = [",".join(f"{x:.9g}" for x in (*row, a)) for row, a in zip(columns, seen, strict=True)]
+    (tmp_path / "run.csv").write_text("\n".join(["time [s],x_rel [m],x_capsule [m],acceleration_rod [m/s^2]", *rows]))
+    run = run_of(tmp_path)
+    own = {"P_on": 6.0, "lag": LAG, "phase": PHASE, "x_start": 0.0, "y_start": 0.0}
+    predicted = np.asarray(run.predict({**TRUTH, **own}, np)[run.names.index("acceleration_rod")])
+    assert np.std(seen) > 15.0
+    assert np.quantile(np.abs(predicted - seen), 0.95) < 0.1
+
+
 @pytest.mark.full
 def test_pulses_explain_a_record_of_pulses(tmp_path: Path) -> None:
     shift = 50 * PERIOD

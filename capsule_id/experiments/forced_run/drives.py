@@ -461,12 +461,14 @@ class PulseRun(OtherRun):
         wave = own["P_on"], 2.0 * np.pi / self.Omega, own["duty"], self.off * own["P_on"]
         return self.parameters_of(theta), Pulses(*wave, phase=own["phase"], lag=own["lag"], reaction=self.reaction)
 
+    def drive_time(self, times: Any) -> Any:
+        # A lag forgets its start in a few periods.
+        return times - self.first + SETTLING_PERIODS * 2.0 * np.pi / self.Omega
+
     def simulated(
         self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
     ) -> Trajectory:
-        # A lag forgets its start in a few periods.
-        earlier = SETTLING_PERIODS * 2.0 * np.pi / self.Omega
-        return super().simulated(theta, p, e, jnp.asarray(times) - self.first + earlier, initial)
+        return super().simulated(theta, p, e, self.drive_time(jnp.asarray(times)), initial)
 
 
 # base run: Runs whose record prescribes the motion of the rod: a shaken base, or a position-controlled inner mass.

@@ -355,6 +355,10 @@ class CapsuleRun(CapsuleForward):
         rate, middle = self.clock
         return middle + jnp.multiply.outer(stretch(rate, theta), self.time - middle)
 
+    def drive_time(self, times: Any) -> Any:
+        """``times`` of the record, s, on the clock of the drive of ``capsule``."""
+        return times
+
     def motion(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Trajectory:
         """Simulate the motion at the samples (n,), X2 = 0 at the first."""
         p, e = self.capsule(theta)
@@ -393,7 +397,7 @@ class CapsuleRun(CapsuleForward):
     def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
         """Acceleration of the rod at the samples, m/s^2, from x_rel (..., n), m, and its rate."""
         p, e = before_samples(self.capsule(theta), xp)
-        return rod_acceleration(p, e, self.true_time(theta), x_rel, rate)
+        return rod_acceleration(p, e, self.drive_time(self.true_time(theta)), x_rel, rate)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
         parts = []
