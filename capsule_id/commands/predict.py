@@ -24,7 +24,7 @@ OPTIONS = {
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write FILE and the figure; 0.
+    """Write FILE and the figure; 0, or 3 where RESULT is not trusted.
 
     Raises
     ------
@@ -36,14 +36,16 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.inference.prediction import predict
     from capsule_id.report.figures import fits, style
 
-    made = predict(cid.load(args.result), args.settings, seed=args.seed)
+    result = cid.load(args.result)
+    say_failed(result)
+    made = predict(result, args.settings, seed=args.seed)
     table = made.table.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode()
     written = [("--out", args.out, table)]
     if args.figure is not None:
         with style.own_style():
             written.append(("--figure", args.figure, style.png(fits.side_by_side(made.panels))))
     write_new_files(written, f": {counted(len(made.table), 'setting')}")
-    return 0
+    return 0 if result.clean else 3
 
 
 def write_new_files(written: Sequence[tuple[str, Path, bytes]], about: str = "") -> None:

@@ -49,10 +49,19 @@ def stated_parameters(
     of: str = "",
     kind: Literal["normal", "positive_normal"] = "positive_normal",
 ) -> list[Parameter]:
-    """The parameter with the prior of a stated quantity; [] where nothing is stated, or an exact value."""
+    """The parameter with the prior of a stated quantity; [] where nothing is stated, or an exact value.
+
+    About 0, a prior of positive values is half-normal.
+    """
     if stated is None or stated.sd == 0.0:
         return []
-    return [parameter(symbol, of, Prior("normal" if _is_open(symbol, stated) else kind, stated.value, stated.sd))]
+    about_0 = "halfnormal" if stated.value == 0.0 and kind == "positive_normal" else kind
+    return [parameter(symbol, of, Prior("normal" if _is_open(symbol, stated) else about_0, stated.value, stated.sd))]
+
+
+def free_parameters(rig: Rig, *, damped: bool) -> list[Parameter]:
+    """k_cubic and, of a support spring, c2, where [model] sets them free."""
+    return [parameter(name) for name in ("k_cubic", "c2")[: 1 + damped] if name in rig.model.free]
 
 
 def _is_open(symbol: str, stated: Quantity) -> bool:
@@ -213,6 +222,7 @@ class CapsuleDecay(CapsuleForward, DecayRecord):
         DecayRecord.__init__(self, table, rig, friction, DecayModel())
         self.set_model(table, rig, friction)
         rows = [parameter("k1"), parameter("c"), *friction.parameters]
+        rows += free_parameters(rig, damped=table.settings.spring is not None and friction.contact is None)
         rows += support_parameters(table, friction, table.label)
         rows.append(parameter("x_start", table.label, Prior("normal", 0.0, self.width)))
         rows.append(parameter("y_start", table.label, Prior("normal", 0.0, self.width * self.rough.Omega_o)))
@@ -255,6 +265,8 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.set_model(table, rig, friction)
         PointTest.__init__(self, table, rig, friction)
+        free = free_parameters(rig, damped=False)
+        self.about = replace(self.about, parameters=(*free, *self.about.parameters))
         self.horizon = SLIDES * 2.0 * self.observed / self.readings["speed"] + REST
 
     def own_parameters(self, table: Table) -> tuple[Parameter, ...]:

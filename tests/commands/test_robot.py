@@ -31,7 +31,7 @@ def test_a_robot_is_fitted_sampled_and_predicted(tmp_path: Path, monkeypatch: py
     made = tmp_path / "predicted.csv"
     asked = ["predict", str(out), str(tmp_path / "settings.csv"), "--out", str(made)]
     asked += ["--figure", str(made.with_suffix(".png"))]
-    assert capsule_id(asked) == 0
+    assert capsule_id(asked) == code
     assert made.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     written = pd.read_csv(made, comment="#")
     loaded = cid.load(out).predict(tmp_path / "settings.csv")

@@ -71,6 +71,19 @@ def test_forward_chooses_the_room() -> None:
         assert [type(e) for e in make_experiments(rig)] == rooms
 
 
+def test_terms_that_are_free_act_in_decays_and_pushes_too() -> None:
+    """Before: runs sampled them, and a decay or push of the same rod kept 0."""
+    gap = {"spring": "soft", "gap": Quantity(1e-3)}
+    rig = replace(
+        bench.rig(decay(2e-3, "capsule", **gap), pushes("capsule")), model=ModelChoices(free=("k_cubic", "c2"))
+    )
+    released, pushed = make_experiments(rig)
+    assert {"k_cubic", "c2"} <= {row.name for row in released.parameters}
+    assert {"k_cubic"} == {"k_cubic", "c2"} & {row.name for row in pushed.parameters}
+    assert cast(CapsuleForward, released).parameters_of({**TRUTH, "k_cubic": 1e8, "c2": 3.0}).c2 == 3.0
+    assert cast(CapsuleForward, pushed).parameters_of({**TRUTH, "k_cubic": 1e8}).k_cubic == 1e8
+
+
 @pytest.mark.parametrize("engine", ["exact", "smooth"])
 def test_the_model_chooses_the_engine(engine: Literal["exact", "smooth"]) -> None:
     rig = replace(bench.rig(decay(2e-3, "capsule"), pushes("capsule")), model=ModelChoices(engine=engine))

@@ -9,6 +9,8 @@ from capsule_id.api import read_rig
 from capsule_id.experiments.forced_run.experiment import CapsuleRun, growth
 from capsule_id.experiments.forced_run.start_state import ROD_DAMPING, ROD_FREQUENCY
 from capsule_id.experiments.kind import make_experiments
+from capsule_id.inference.target import LogPosterior
+from capsule_id.parameters import Prior
 from capsule_id.physics.drives import Pulses, RecordedDrive
 from capsule_id.physics.model import CapsuleParameters, Drive
 from capsule_id.physics.simulation import simulate
@@ -151,6 +153,45 @@ def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:
     assert not {"phase[run]", "I_d[run]"} & {row.name for row in run.parameters}
     assert largest_residual(run, {"K": K}) < 1.15
     assert largest_residual(run, {"K": 1.1 * K}) > 3.0
+
+
+def test_a_lag_near_0_has_a_prior_with_its_mass_there(tmp_path: Path) -> None:
+    """Before: a traceback, ZeroDivisionError."""
+    write(tmp_path, Pulses(6.0, PERIOD, DUTY), 0.0, None, PULSES.replace("value = 6, sd = 2", "value = 0, sd = 2"))
+    target = LogPosterior(read_rig(tmp_path), [run_of(tmp_path)])
+    (row,) = [row for row in target.parameters if row.name == "lag"]
+    assert row.prior == Prior("halfnormal", 0.0, 2e-3)
+    assert np.all(np.isfinite(target.prior_sd))
+
+
+RECORDED = 'drive = "recorded"\n'
+
+
+@pytest.mark.parametrize(
+    ("settings", "rule", "instead"),
+    [
+        # Before: read, and without any effect.
+        (
+            RECORDED + 'current_gain_sd = { value = 5, unit = "%" }\n',
+            "current_gain_sd needs a channel that the motion predicts",
+            RECORDED,
+        ),
+        (
+            RECORDED + 'acceleration_rod_delay_sd = { value = 1, unit = "ms" }\n',
+            "acceleration_rod_delay_sd needs a channel",
+            RECORDED + 'x_rel_delay_sd = { value = 1, unit = "ms" }\n',
+        ),
+        # Before: pulses that are always on.
+        (PULSES.replace('unit = "%"', 'unit = "1"'), "duty must lie between 0 and 100 %", PULSES),
+    ],
+)
+def test_what_would_have_no_effect_is_refused(tmp_path: Path, settings: str, rule: str, instead: str) -> None:
+    for own in (settings, instead):
+        write(tmp_path, Pulses(6.0, PERIOD, DUTY), 0.0, np.cos(TIME) if own.startswith(RECORDED) else None, own)
+        if own == settings:
+            assert rule in str(fault_of(tmp_path))
+        else:
+            read_rig(tmp_path)
 
 
 @pytest.mark.full

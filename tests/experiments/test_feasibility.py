@@ -108,6 +108,18 @@ def test_the_held_rod_is_a_capsule_too_heavy_to_move() -> None:
     assert largest == pytest.approx(np.abs(force).max(), rel=5e-3)
 
 
+def test_a_drive_that_reacts_on_the_capsule_pushes_it_too() -> None:
+    """Before: |f| alone, 3.1 N, and "the capsule cannot set off", of a capsule that the exact engine moves."""
+    Omega, P_d = 200.0, 4.0
+    times = np.linspace(0.0, 12 * 2.0 * np.pi / Omega, 4_001)
+    drive = Excitation(P_d, Omega, reaction=1.0)
+    t = simulate(CapsuleParameters(G=np.inf, k2=0.0, **{**TRUTH, "mu": 1e6}), drive, times)
+    force = TRUTH["k1"] * np.asarray(t.x_rel) + TRUTH["c"] * np.asarray(t.Y1) - P_d * np.cos(Omega * times)
+    largest, _ = held_rod({**TRUTH, "reaction": 1.0}, P_d, Omega, np.inf)
+    assert largest == pytest.approx(np.abs(force).max(), rel=5e-3)
+    assert largest > 1.5 * held_rod(TRUTH, P_d, Omega, np.inf)[0]
+
+
 def test_a_drive_of_hours_is_judged_by_its_start() -> None:
     """Against a step of the same load: overshoot exp(-pi zeta/sqrt(1 - zeta^2)) beyond P_d/k1, no spring in reach."""
     largest, touches = held_rod({**TRUTH, "k2": 18960.0, "c": 0.5}, P_d=1.0, Omega=1e-3, G=1.0)

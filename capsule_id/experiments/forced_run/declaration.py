@@ -18,7 +18,7 @@ from capsule_id.records.view import describe_run
 from capsule_id.rig.filters import median_step, uneven_sampling
 from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry, QuantityRule, SupportSettings
-from capsule_id.rig.toml import ANY, NOT_NEGATIVE
+from capsule_id.rig.toml import ANY, NOT_NEGATIVE, SHARE
 from capsule_id.views import Facts, Finding, Message, stated_p
 
 # rules: Rules on the drive of a forced run: what each kind of drive needs, and what it does not have.
@@ -70,6 +70,14 @@ def _uneven_base(settings: Any, columns: Mapping[str, Column]) -> str:
     unstated = settings.Omega is None and settings.f is None
     fault = uneven_sampling(columns["time"].values) if unstated else None
     return "" if fault is None else fault.value
+
+
+def _unread(settings: Any, columns: Mapping[str, Column]) -> str:
+    """The first stated error of a channel that no reading of the run has: it would have no effect."""
+    inputs = {BASE: "x_base", RECORDED: "current"}
+    read = [name for name, *_ in _CHANNELS if name in columns and name != inputs.get(settings.drive)]
+    errors = (f"{name}_{error}_sd" for name, *_ in _CHANNELS if name not in read for error in ("gain", "delay"))
+    return next((key for key in errors if getattr(settings, key) is not None), "")
 
 
 def present(*names: str) -> Callable[[Any, Mapping[str, Column]], str]:
@@ -127,6 +135,10 @@ DRIVE_RULES = (
     DriveRule(
         (RECORDED,), lacks("current", 3), "drive",
         'drive = "recorded" needs the column current and another channel', "{columns}", "add it",
+    ),
+    DriveRule(
+        DRIVES, _unread, "{found}", "{found} needs a channel that the motion predicts", "{columns}",
+        "remove it; the gain of a current that drives the run belongs to K", of_key=True,
     ),
     DriveRule(
         SWITCHED, present("current"), "drive", 'drive = "{drive}" has no column current', "{columns}",
@@ -313,7 +325,7 @@ class RunSettings(ChannelSettings):
     Omega: Annotated[float | None, QuantityRule("rad/s")] = None
     f: Annotated[float | None, QuantityRule("Hz")] = None
     P_d: Annotated[Quantity | None, QuantityRule("N", has_sd=True)] = None
-    duty: Annotated[float | None, QuantityRule("1")] = None
+    duty: Annotated[float | None, QuantityRule("1", SHARE)] = None
     P_on: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
     lag: Annotated[Quantity | None, QuantityRule("s", NOT_NEGATIVE, has_sd=True)] = None
     normal_force: Annotated[float | None, QuantityRule("N")] = None

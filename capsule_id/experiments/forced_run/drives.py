@@ -73,7 +73,8 @@ def feasibility(
     Parameters
     ----------
     table : a ``forced_run``
-    theta : values by symbol, SI: m1, m2, k1, c, k2 (of this run's spring, if any), and K where P_d is not stated
+    theta : values by symbol, SI: m1, m2, k1, c, k2 (of this run's spring, if any), K where P_d is not stated, and reaction,
+        the share of the drive's force that pushes the capsule back (default 0)
     F_b : break-away force, N
     P_d, G : amplitude of the drive, N, and gap, m, infinite without a spring; None: as stated, P_d else ``K`` (N/A) times
         the current's amplitude at Omega
@@ -86,7 +87,9 @@ def feasibility(
     found: dict[str, Facts] = {}
     # The rod of a capsule that stays where it is does not reach the gap.
     grazing, per_length = (float(grazing_load(m1, k1, c, length, Omega)) for length in (G, 1.0))
-    if P_d < grazing < np.inf and P_d / per_length * float(np.hypot(k1, c * Omega)) <= F_b:
+    # The force on the capsule per length of the rod's motion: of spring and damper, less the drive's where it reacts there.
+    push = m1 * Omega**2 if theta.get("reaction") else float(np.hypot(k1, c * Omega))
+    if P_d < grazing < np.inf and P_d / per_length * push <= F_b:
         found["runs.contact"] = {"Omega": Omega, "gap_mm": 1e3 * G, "needed": grazing, "P_d": P_d}
     # The rod does not push the capsule out of its place.
     reached, touches = held_rod(theta, P_d, Omega, G)
@@ -112,12 +115,14 @@ def feasibility(
 
 
 def held_rod(theta: Mapping[str, float], P_d: float, Omega: float, G: float) -> tuple[float, bool]:
-    """Largest force |f| of the rod on a capsule held at rest, N, and whether the rod touches the spring.
+    """Largest force of the rod, and of the drive where it reacts there, on a capsule held at rest, N; whether the rod
+    touches the spring.
 
-    The rod starts from rest. A capsule at rest sticks while |f| <= F_b, so the test for its motion is exact.
+    The rod starts from rest. A capsule at rest sticks while this force is at most F_b, so the test for its motion is exact.
     """
-    m1, k1, c, k2 = (float(theta.get(name, 0.0)) for name in ("m1", "k1", "c", "k2"))
-    capsule = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=G)
+    own = {name: float(theta.get(name, 0.0)) for name in ("m1", "k1", "c", "k2", "k_cubic", "c2")}
+    m1, c, k2 = own["m1"], own["c"], own["k2"]
+    capsule = CapsuleParameters(**own, m2=np.inf, mu=np.inf, v_s=np.inf, G=G)
     held, e = without_absent(capsule, Excitation(P_d, Omega))
 
     def rate(t: float, state: np.ndarray) -> list[float]:
@@ -130,7 +135,8 @@ def held_rod(theta: Mapping[str, float], P_d: float, Omega: float, G: float) -> 
     touch = max(0.25 * contact_time(m1, float("inf"), k2), span / HELD_STEPS)
     step = min(period / 40.0, touch)
     run = solve_ivp(rate, (0.0, span), [0.0, 0.0], "LSODA", rtol=HELD_TOLERANCE, atol=1e-10, max_step=step)
-    return float(np.max(np.abs(rod_on_capsule(held, *run.y)))), bool(np.max(run.y[0]) >= G)
+    force = rod_on_capsule(held, *run.y) - theta.get("reaction", 0.0) * P_d * np.cos(Omega * run.t)
+    return float(np.max(np.abs(force))), bool(np.max(run.y[0]) >= G)
 
 
 def contact_time(m1: float, m2: float, k2: float) -> float:
@@ -150,7 +156,7 @@ def lint_feasibility(table: Table, rig: Rig, estimate: Estimate) -> list[Finding
     names |= {} if settings.spring is None else {"k2": f"k2[{settings.spring}]"}
     values = {symbol: estimate(name) for symbol, name in names.items()}
     guessed = [names[symbol] for symbol, (_, measured) in values.items() if not measured]
-    theta = {"m1": rig.mass("m1"), "m2": rig.mass("m2"), "g": rig.g.value}
+    theta = {"m1": rig.mass("m1"), "m2": rig.mass("m2"), "g": rig.g.value, "reaction": rig.model.share_of_reaction}
     theta |= {symbol: value for symbol, (value, _) in values.items()}
     normal = {} if settings.normal_force is None else {NORMAL_FORCE: settings.normal_force}
     findings = feasibility(table, theta, float(EQUATION_1.force({**theta, **normal}).forward(0.0)))
@@ -165,9 +171,10 @@ def check_feasible(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
     # The rule for contact and slip of a run from rest holds on level ground, with a spring in front of the rod.
     for run in (run for run in runs if not run.ground and run.table.settings.spring_back is None):
         theta = run.local(fit.values)
-        p, e = run.capsule(theta)
-        F_b, P_d, G = (float(x) for x in (run.law(theta).forward(0.0), e.P_d, p.G))  # pyright: ignore
-        findings += feasibility(run.table, theta, F_b, P_d, G)
+        (p, e), law = run.capsule(theta), run.law(theta)
+        F_b = min(float(law.forward(0.0)), float(law.backward(0.0)))
+        P_d, G = (float(x) for x in (e.P_d, p.G))  # pyright: ignore
+        findings += feasibility(run.table, {**theta, "reaction": run.reaction}, F_b, P_d, G)
     return findings
 
 

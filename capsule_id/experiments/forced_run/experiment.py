@@ -13,6 +13,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, scatter_prior, stated_rate, stretch
 from capsule_id.experiments.capsule_experiment import (
     CapsuleForward,
+    free_parameters,
     lag_parameters,
     stated_parameters,
     stated_starts,
@@ -205,10 +206,9 @@ class CapsuleRun(CapsuleForward):
 
     def _sampled(self) -> list[Parameter]:
         """The parameters of the run with their priors."""
-        of, whole, settings, free = self.label, self.about.record, self.table.settings, self.rig.model.free
+        of, whole, settings = self.label, self.about.record, self.table.settings
         rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
-        damped = self.spring is not None and self.friction.contact is None
-        rows += [parameter(name) for name in ("k_cubic", "c2")[: 1 + damped] if name in free]
+        rows += free_parameters(self.rig, damped=self.spring is not None and self.friction.contact is None)
         rows += [*clock_parameters(self.table, self.rig), *instrument_parameters(self.table)]
         rows += support_parameters(self.table, self.friction, whole)
         if "current" in self.names:
