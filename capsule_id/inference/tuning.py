@@ -23,6 +23,7 @@ from capsule_id.physics.drives import capsule_and_drive
 from capsule_id.physics.model import Initial, without_absent
 from capsule_id.records.motion import measured_motion
 from capsule_id.records.tones import recorded_drive, stated_gap, stated_Omega
+from capsule_id.rig.model import Quantity, Table
 
 #: Draws of the posterior at which every setting is computed.
 DRAWS = 16
@@ -172,7 +173,9 @@ def tune(
     place = {name: (best[name] - low) / (high - low) for name, (low, high) in bounds.items()}
     return Tuning(
         best,
-        _table(model, best, operating_points(result, chosen, drive), faster_than, result.trust),
+        _table(
+            model, best, operating_points(result, chosen, drive), _fitted(result, chosen), faster_than, result.trust
+        ),
         _other_motions(model, best, seed),
         _sensitivity(model, best, bounds),
         surface,
@@ -239,20 +242,22 @@ def _leaves(
         If the spring was not fitted, or a value is missing.
     """
     rig, springs = result.rig, by_index("k2", chosen)
-    runs = [table.settings for table in rig.tables if isinstance(table.settings, RunSettings)]
+    of_runs = [table for table in rig.tables if isinstance(table.settings, RunSettings)]
+    runs = [table.settings for table in of_runs]
     front = [name for name in springs if name not in {run.spring_back for run in runs} - {run.spring for run in runs}]
     spring = front[0] if spring is None and len(front) == 1 else spring
     if spring is not None and spring not in springs:
         raise InputError("spring must be a fitted one", spring, f"choose from {', '.join(springs) or 'none'}")
     own = {*CAPSULE_LEAVES, *DRIVES[drive]}
-    values: dict[str, Any] = {name: LEAVES[name].default for name in DRIVES[drive]}
-    values |= {"reaction": rig.model.share_of_reaction, "slope": 0.0, "N0": 0.0}
+    values: dict[str, Any] = {name: LEAVES[name].default for name in DRIVES[drive]} | _fitted(result, {})
     # Without a support spring the rod moves freely.
     values |= {"k2": 0.0, "G": np.inf} if not front and not {"k2", "G"} & {*given, *searched} else {}
-    stated = [(name, getattr(rig, name)) for name in ("m1", "m2", "g", "slope", "N0")]
     progressions = [table.settings for table in rig.tables if isinstance(table.settings, ProgressionSettings)]
-    stated += [(name, getattr(own, name)) for own in progressions for name in (AMPLITUDE[drive], "lag")]
-    values |= {name: quantity.value for name, quantity in stated if quantity is not None}
+    for name, stating in ((AMPLITUDE[drive], progressions), ("lag", [*runs, *progressions])):
+        stated = {quantity.value for one in stating if (quantity := getattr(one, name)) is not None}
+        # Of several values, none is that of the search.
+        values |= {name: stated.pop() if len(stated) == 1 else None} if stated else {}
+    values |= {"N0": None} if any(run.normal_force is not None for run in runs) else {}
     differ = len({(run.spring_back, run.gap_back) for run in runs}) > 1
     if differ and given.get("k2_back") != 0.0 and not {"k2_back", "G_back"} <= {*given, *searched}:
         rule = "tune needs k2_back and G_back where the runs do not have the same spring behind the rod"
@@ -260,9 +265,9 @@ def _leaves(
     square = any(getattr(table.settings, "drive", "") == "square" for table in rig.tables)
     if drive == "pulses" and square and "P_off" not in {*given, *searched}:
         raise InputError("tune needs P_off after a fit of a square wave", "none", "give -P_on, or 0 for pulses")
-    values |= {"k2_back": 0.0, "G_back": np.inf} if differ else _behind(runs[0], chosen) if runs else {}
+    values |= {"k2_back": 0.0, "G_back": np.inf} if differ else _behind(of_runs[0], chosen) if runs else {}
     values |= {**result.fixed, **chosen} | ({} if spring is None else {"k2": springs[spring]}) | dict(given)
-    needed = {name for name in own if LEAVES[name].default is None} - searched
+    needed = {name for name in own if LEAVES[name].default is None or values.get(name, 0.0) is None} - searched
     for name in sorted(needed):
         if values.get(name) is None:
             leaf = LEAVES[name]
@@ -272,10 +277,24 @@ def _leaves(
     return {name: x for name, x in values.items() if name in own and x is not None and name not in searched}
 
 
-def _behind(run: RunSettings, chosen: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _fitted(result: Result, chosen: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Leaves of model and drive as stated in [rig] and [model], and as fitted, () or (draws,), by symbol."""
+    rig = result.rig
+    stated = ((name, getattr(rig, name)) for name in ("m1", "m2", "g", "slope", "N0"))
+    values = {"reaction": rig.model.share_of_reaction, "slope": 0.0, "N0": 0.0}
+    values |= {name: quantity.value for name, quantity in stated if quantity is not None}
+    return {name: x for name, x in {**values, **result.fixed, **chosen}.items() if name in LEAVES}
+
+
+def _value(chosen: Mapping[str, np.ndarray], symbol: str, table: Table[Any], stated: Quantity) -> Any:
+    """The fitted value of a setting of a run, (draws,), else the ``stated`` one."""
+    return chosen.get(f"{symbol}[{table.label}]", chosen.get(symbol, stated.value))
+
+
+def _behind(table: Table[Any], chosen: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """k2_back, (draws,) N/m, and G_back, m, of a run with a spring behind the rod; {} without one."""
-    k2 = chosen.get(f"k2[{run.spring_back}]")
-    return {} if run.gap_back is None or k2 is None else {"k2_back": k2, "G_back": run.gap_back.value}
+    k2, gap = chosen.get(f"k2[{table.settings.spring_back}]"), table.settings.gap_back
+    return {} if gap is None or k2 is None else {"k2_back": k2, "G_back": _value(chosen, "G_back", table, gap)}
 
 
 def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: str) -> list[tuple[str, Values, float]]:
@@ -289,7 +308,10 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
         settings = table.settings
         if not isinstance(settings, RunSettings | ProgressionSettings) or settings.drive != drive:
             continue
-        ground = {name: quantity.value for name, quantity in settings.ground.items()}
+        ground = {name: _value(chosen, name, table, quantity) for name, quantity in settings.ground.items()}
+        # A stated 0 differs from [rig] too.
+        ground = {name: 0.0 for name in ("slope", "N0") if getattr(settings, name) is not None} | ground
+        ground |= {"lag": settings.lag.value} if settings.lag is not None and "lag" not in chosen else {}
         if isinstance(settings, ProgressionSettings):
             rows, source = settings_of(table.columns, settings)
             speed = table["distance"] / (rows[:, 0] * rows[:, 1])
@@ -298,6 +320,10 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
                 own |= ground
                 own |= {AMPLITUDE[drive]: size} if source == "column" else {}
                 own |= {AMPLITUDE[drive]: size * chosen["K"]} if source == "current" else {}
+                if source == "setting":
+                    own |= {
+                        AMPLITUDE[drive]: _value(chosen, AMPLITUDE[drive], table, getattr(settings, AMPLITUDE[drive]))
+                    }
                 words = [f"{1e3 * period:g} ms", f"duty {duty:g}" if drive == "pulses" else ""]
                 words += [{"column": f"{size:g} N", "current": f"{size:g} A"}.get(source, "")]
                 same = np.all(rows[:, (0, 2, 3)] == (period, duty, size), axis=1)
@@ -307,10 +333,16 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
         k2 = 0.0 if settings.spring is None else chosen.get(f"k2[{settings.spring}]")
         current = recorded_drive(table) if drive == "harmonic" and settings.P_d is None else None
         amplitude = getattr(settings, AMPLITUDE[drive])
-        force = chosen["K"] * current.amplitude if current and "K" in chosen else amplitude and amplitude.value
+        force = amplitude and _value(chosen, AMPLITUDE[drive], table, amplitude)
+        force = chosen["K"] * current.amplitude if current and "K" in chosen else force
         if k2 is None or force is None:
             continue
-        own = {"k2": k2, "G": stated_gap(table).value, AMPLITUDE[drive]: force, **ground, **_behind(settings, chosen)}
+        if settings.normal_force is not None:
+            known = _fitted(result, chosen) | ground
+            weight = (known["m1"] + known["m2"]) * known["g"] * np.cos(known["slope"])
+            ground["N0"] = settings.normal_force - weight
+        gap = _value(chosen, "G", table, stated_gap(table))
+        own = {"k2": k2, "G": gap, AMPLITUDE[drive]: force, **ground, **_behind(table, chosen)}
         Omega = stated_Omega(table)
         own |= {"Omega": Omega} if drive == "harmonic" else {"period": 2.0 * np.pi / Omega, "duty": settings.duty}
         found.append((table.label, own, measured_motion(table).mean_velocity))
@@ -318,15 +350,20 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
 
 
 def _table(
-    model: _Model, best: Values, points: list[tuple[str, Values, float]], faster_than: float | None, trust: str
+    model: _Model,
+    best: Values,
+    points: list[tuple[str, Values, float]],
+    fitted: Values,
+    faster_than: float | None,
+    trust: str,
 ) -> pd.DataFrame:
-    """``Tuning.table``."""
+    """``Tuning.table``. Measured points are those of the ``fitted`` rig, not of the one that was searched or given."""
     rows, threshold = {}, MM_PER_M * (faster_than or 0.0)
     shown = list(dict.fromkeys([*best, *(name for _, own, _ in points for name in own)]))
     leaves = {**model.leaves, **best}
     # A point names its spring behind the rod, and the force between its pulses, where it has them.
     none = {name: x for name, x in {"k2_back": 0.0, "G_back": np.inf, "P_off": 0.0}.items() if name in leaves}
-    everything = [leaves, *({**leaves, **none, **own} for _, own, _ in points)]
+    everything = [leaves, *({**leaves, **none, **fitted, **own} for _, own, _ in points)]
     settings = {
         name: np.stack([np.broadcast_to(one[name], model.draws) for one in everything]) for name in everything[0]
     }

@@ -306,7 +306,7 @@ def test_runs_with_a_spring_behind_the_rod_are_tuned_and_drawn_with_it_or_not_at
         fit_of(values, rig=other), many, "harmonic", {"P_d"}, {"k2_back": 0.0, "Omega": 60.0, "G": 1e-3}, "a"
     )
     points = operating_points(fit_of(values, rig=other), many, "harmonic")
-    table = tuning._table(tuning._Model(leaves, "harmonic", 2), {"P_d": 5.0}, points, None, "trusted")
+    table = tuning._table(tuning._Model(leaves, "harmonic", 2), {"P_d": 5.0}, points, {}, None, "trusted")
     assert list(table["k2_back [N/m]"]) == [0.0, 5050.0, 0.0]
     assert list(table["G_back [m]"]) == [np.inf, 8e-4, np.inf]
     np.testing.assert_array_equal(asked[0]["k2_back"][1], chosen["k2[b]"])

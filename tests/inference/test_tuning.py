@@ -12,7 +12,7 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.inference import tuning
 from capsule_id.inference.result import Result
-from capsule_id.inference.tuning import operating_points, score, tune
+from capsule_id.inference.tuning import _fitted, operating_points, score, tune
 from capsule_id.motions.response import Settling
 from capsule_id.motions.sweep import motion_map
 from capsule_id.physics.model import CapsuleParameters, Excitation
@@ -24,6 +24,7 @@ TRUTH = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.66, "v_s": 0.3
 SD = {"m1": 1e-3, "m2": 1e-3, "k1": 2e-3, "c": 3e-3, "mu": 9e-3, "v_s": 3e-2, "k2[soft]": 1e-3}
 BOUNDS = {"P_d": (1.0, 5.0), "Omega": (30.0, 50.0)}
 GAP = {"G": 1e-3}
+ROBOT_NAMES = ("m1", "m2", "k1", "c", "mu", "v_s", "ratio", "P_on", "lag")
 PERIODS = Settling(80, 24, exponent_periods=0)
 
 
@@ -171,15 +172,61 @@ def test_operating_points_of_runs(tmp_path: Path) -> None:
     assert all(f"k2[{table.settings.spring}]" in chosen for table in rig.tables if table.label in [x[0] for x in found])
 
 
+def test_operating_points_are_those_of_the_fitted_rig(tmp_path: Path) -> None:
+    """Before: prior means of what was fitted, the slope of [rig] for a run on level ground, the weight for a stated load."""
+    synthesize(tmp_path / "rig", 3, name="rig", runs=True)
+    rig = replace(read_rig(tmp_path / "rig"), slope=Quantity(0.05))
+    chosen = {"K": np.array([2.0, 2.2]), "k2[medium]": np.array([1.8e4, 1.9e4]), "G[run_1]": np.array([1.1e-3, 1.2e-3])}
+    chosen |= {"m1": np.array([0.11, 0.11]), "m2": np.array([0.53, 0.55])}
+    for own, expected in (
+        ({"slope": Quantity(0.0)}, {"slope": 0.0, "N0": None}),
+        ({"slope": Quantity(0.02)}, {"slope": 0.02}),
+        ({"slope": Quantity(0.0), "normal_force": 3.0}, {"N0": 3.0 - (chosen["m1"] + chosen["m2"]) * rig.g.value}),
+    ):
+        tables = [replace(t, settings=replace(t.settings, **own)) if t.label == "run_1" else t for t in rig.tables]
+        (_, settings, _), *_ = operating_points(
+            fit_of(TRUTH, rig=replace(rig, tables=tuple(tables))), chosen, "harmonic"
+        )
+        assert settings["G"] is chosen["G[run_1]"]
+        for name, value in expected.items():
+            if value is None:
+                assert settings.get(name, 0.0) == 0.0
+            else:
+                np.testing.assert_allclose(settings[name], value, rtol=1e-12)
+    known = _fitted(fit_of(TRUTH, rig=rig), chosen)
+    assert (known["slope"], known["reaction"]) == (0.05, 0.0)
+    assert known["m2"] is chosen["m2"]
+
+
+def test_a_measured_setting_is_predicted_with_the_fitted_rig_whatever_is_searched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before: with the force that was given, 10.9 mm/s for 0.6 measured."""
+    design = RobotDesign(1e-3 * np.array([60.0]), np.full(1, 0.3))
+    synthesize_robot(tmp_path / "rig", 1, design, model='reaction = "capsule"\nfree = ["ratio", "lag"]')
+    fit = fit_of({name: ROBOT[name] for name in ROBOT_NAMES}, rig=read_rig(tmp_path / "rig"))
+    chosen = {name: np.full(2, ROBOT[name]) for name in ROBOT_NAMES}
+    asked = list[Any]()
+    monkeypatch.setattr(
+        tuning._Model, "velocity", lambda model, settings, how: asked.append(settings) or np.zeros((2, 2))
+    )
+    given = {"duty": 0.3, "P_on": 2.0 * ROBOT["P_on"], "m2": 0.4}
+    model = tuning._Model(tuning._leaves(fit, chosen, "pulses", {"period"}, given, None), "pulses", 2)
+    points = operating_points(fit, chosen, "pulses")
+    tuning._table(model, {"period": 0.08}, points, _fitted(fit, chosen), None, "trusted")
+    np.testing.assert_allclose(asked[0]["P_on"], [[2.0 * ROBOT["P_on"]] * 2, [ROBOT["P_on"]] * 2])
+    np.testing.assert_allclose(asked[0]["m2"], [[0.4] * 2, [ROBOT["m2"]] * 2])
+    np.testing.assert_allclose(asked[0]["period"][:, 0], [0.08, 0.06])
+
+
 @pytest.mark.full
 def test_a_robot_is_tuned_by_period_and_duty_beside_its_measured_settings(tmp_path: Path, quick: None) -> None:
     """Stated reaction and a fixed lag enter; the measured settings are predicted as they were measured."""
     periods = 1e-3 * np.array([40.0, 60.0, 80.0, 120.0])
     design = RobotDesign(periods, np.full(4, 0.3), session_sd=1e-9, trial_scatter=1e-9, reading_sd=1e-6)
     synthesize_robot(tmp_path / "rig", 1, design, model='reaction = "capsule"\nfree = ["ratio", "lag"]')
-    names = ("m1", "m2", "k1", "c", "mu", "v_s", "ratio", "P_on", "lag")
-    fit = fit_of({name: ROBOT[name] for name in names}, rig=read_rig(tmp_path / "rig"))
-    fit.posterior.draws[:] = [ROBOT[name] for name in names]  # type: ignore[union-attr]
+    fit = fit_of({name: ROBOT[name] for name in ROBOT_NAMES}, rig=read_rig(tmp_path / "rig"))
+    fit.posterior.draws[:] = [ROBOT[name] for name in ROBOT_NAMES]  # type: ignore[union-attr]
     found = tune(fit, {"period": (0.03, 0.16), "duty": (0.2, 0.5)}, draws=2)
     measured = found.table.iloc[1:]
     assert [label for label, *_ in found.points] == [f"progression: {ms} ms, duty 0.3" for ms in (40, 60, 80, 120)]
