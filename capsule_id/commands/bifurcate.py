@@ -426,7 +426,10 @@ def overlay(
         if not isinstance(table.settings, RunSettings):
             continue
         s = table.settings
-        if s.drive != "harmonic" or s.spring is None or s.spring_back is not None:
+        ground = [(s.ground.get(name, Quantity(0.0)), values.get(name, 0.0)) for name in ("slope", "N0")]
+        if s.normal_force is not None or any(abs(own.value - x) > VISIBLE * own.sd for own, x in ground):
+            found = "another slope, pressing force or load"
+        elif s.drive != "harmonic" or s.spring is None or s.spring_back is not None:
             found = "no harmonic force, no support spring, or a spring behind the rod"
         else:
             found = _point_or_reason(table, _settings(table, known), over, x, values, spring)

@@ -126,8 +126,10 @@ def whole_number(name: str, text: str, least: int = 0) -> int:
     return int(value)
 
 
-def fitted_values(directory: Path) -> dict[str, float]:
-    """Fitted values (maximum of the posterior) of DIR/parameters.json by name, SI.
+def fitted_values(directory: Path) -> dict[str, float | None]:
+    """Fitted values (maximum of the posterior) of DIR/parameters.json by name, SI, and those that its folder states.
+
+    None: the folder states several.
 
     Raises
     ------
@@ -138,7 +140,7 @@ def fitted_values(directory: Path) -> dict[str, float]:
     rule, remedy = "--result takes a result of fit-params", "run fit-params first, or check the path"
     with refusing_damage(rule, remedy, file, lambda error: type(error).__name__):
         saved = json.loads(file.read_text(encoding="utf-8"))
-        values = {name: float(row["map"]) for name, row in saved["parameters"].items()}
+        values = saved.get("fixed", {}) | {name: float(row["map"]) for name, row in saved["parameters"].items()}
         law = str(saved.get("provenance", {}).get("friction", EQUATION_1))
     # The fitted values hold the free parameters of eq. (1) too.
     if law.split(",")[0] != EQUATION_1:

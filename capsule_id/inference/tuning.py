@@ -14,7 +14,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.declaration import RunSettings
 from capsule_id.experiments.progression.declaration import AMPLITUDE, ProgressionSettings, settings_of
 from capsule_id.inference.prediction import random_draws, require_equation_1
-from capsule_id.inference.result import Result
+from capsule_id.inference.result import Result, held_leaves
 from capsule_id.motions.response import REST, Settling
 from capsule_id.motions.sweep import QUANTILES, MotionColumns, SweepPoints, compute, spread_starts
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, by_index
@@ -253,18 +253,12 @@ def _leaves(
     # Without a support spring the rod moves freely.
     values |= {"k2": 0.0, "G": np.inf} if not front and not {"k2", "G"} & {*given, *searched} else {}
     progressions = [table.settings for table in rig.tables if isinstance(table.settings, ProgressionSettings)]
-    for name, stating in ((AMPLITUDE[drive], progressions), ("lag", [*runs, *progressions])):
-        stated = {quantity.value for one in stating if (quantity := getattr(one, name)) is not None}
-        # Of several values, none is that of the search.
-        values |= {name: stated.pop() if len(stated) == 1 else None} if stated else {}
-    values |= {"N0": None} if any(run.normal_force is not None for run in runs) else {}
+    stated = {quantity.value for one in progressions if (quantity := getattr(one, AMPLITUDE[drive])) is not None}
+    values |= {AMPLITUDE[drive]: stated.pop()} if len(stated) == 1 else {}
     differ = len({(run.spring_back, run.gap_back) for run in runs}) > 1
     if differ and given.get("k2_back") != 0.0 and not {"k2_back", "G_back"} <= {*given, *searched}:
         rule = "tune needs k2_back and G_back where the runs do not have the same spring behind the rod"
         raise InputError(rule, "none", "give both, in N/m and m; k2_back = 0: none")
-    square = any(getattr(table.settings, "drive", "") == "square" for table in rig.tables)
-    if drive == "pulses" and square and "P_off" not in {*given, *searched}:
-        raise InputError("tune needs P_off after a fit of a square wave", "none", "give -P_on, or 0 for pulses")
     values |= {"k2_back": 0.0, "G_back": np.inf} if differ else _behind(of_runs[0], chosen) if runs else {}
     values |= {**result.fixed, **chosen} | ({} if spring is None else {"k2": springs[spring]}) | dict(given)
     needed = {name for name in own if LEAVES[name].default is None or values.get(name, 0.0) is None} - searched
@@ -279,11 +273,8 @@ def _leaves(
 
 def _fitted(result: Result, chosen: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Leaves of model and drive as stated in [rig] and [model], and as fitted, () or (draws,), by symbol."""
-    rig = result.rig
-    stated = ((name, getattr(rig, name)) for name in ("m1", "m2", "g", "slope", "N0"))
-    values = {"reaction": rig.model.share_of_reaction, "slope": 0.0, "N0": 0.0}
-    values |= {name: quantity.value for name, quantity in stated if quantity is not None}
-    return {name: x for name, x in {**values, **result.fixed, **chosen}.items() if name in LEAVES}
+    values = {**held_leaves(result.rig), **result.fixed, **chosen}
+    return {name: x for name, x in values.items() if name in LEAVES}
 
 
 def _value(chosen: Mapping[str, np.ndarray], symbol: str, table: Table[Any], stated: Quantity) -> Any:
@@ -358,12 +349,12 @@ def _table(
     trust: str,
 ) -> pd.DataFrame:
     """``Tuning.table``. Measured points are those of the ``fitted`` rig, not of the one that was searched or given."""
-    rows, threshold = {}, MM_PER_M * (faster_than or 0.0)
+    rows, threshold, known = {}, MM_PER_M * (faster_than or 0.0), {k: x for k, x in fitted.items() if x is not None}
     shown = list(dict.fromkeys([*best, *(name for _, own, _ in points for name in own)]))
     leaves = {**model.leaves, **best}
     # A point names its spring behind the rod, and the force between its pulses, where it has them.
     none = {name: x for name, x in {"k2_back": 0.0, "G_back": np.inf, "P_off": 0.0}.items() if name in leaves}
-    everything = [leaves, *({**leaves, **none, **fitted, **own} for _, own, _ in points)]
+    everything = [leaves, *({**leaves, **none, **known, **own} for _, own, _ in points)]
     settings = {
         name: np.stack([np.broadcast_to(one[name], model.draws) for one in everything]) for name in everything[0]
     }

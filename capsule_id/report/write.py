@@ -26,7 +26,7 @@ import xarray as xr
 from capsule_id.console import one_line, refusing_damage
 from capsule_id.errors import InputError, writing
 from capsule_id.experiments.kind import Registry
-from capsule_id.inference.result import Pointwise, Posterior, Result
+from capsule_id.inference.result import Pointwise, Posterior, Result, held_leaves
 from capsule_id.output import as_utf8, publish, work_in_progress, write_file
 from capsule_id.parameters import TABLE, Name
 from capsule_id.report.columns import columns_of, errors_left_out
@@ -94,6 +94,7 @@ def parameters_json(result: Result) -> dict[str, object]:
             str(name): {column.key: _plain(column.of(row)) for column in columns}
             for name, row in result.summary.to_dict("index").items()
         },
+        "fixed": {**held_leaves(result.rig), **result.fixed},
         "verdict": {
             "clean": result.clean,
             "findings": [
@@ -367,7 +368,10 @@ def data_tree(result: Result) -> xr.DataTree:
     chain |= {"ensemble": ("chain", np.repeat(np.arange(ensembles), walkers))}
     # Exact masses stand among the draws as constants, so that whoever computes with draws has them all in one place.
     columns = dict(zip(posterior.names, np.moveaxis(_by_chain(posterior.draws), -1, 0), strict=True))
-    columns |= {name: np.full((chains, draws), value, np.float64) for name, value in result.fixed.items()}
+    stated = held_leaves(result.rig)
+    held = {name: x for name in ("reaction", "slope", "N0", "lag") if (x := stated.get(name)) and name not in columns}
+    held |= result.fixed
+    columns |= {name: np.full((chains, draws), value, np.float64) for name, value in held.items()}
     about_lp = {"units": "1", "meaning": "log-posterior density, unconstrained space"}
     about_acceptance = {"units": "1", "meaning": "share of accepted proposals of the walker"}
     stats = {
@@ -375,7 +379,7 @@ def data_tree(result: Result) -> xr.DataTree:
         "acceptance": ("chain", posterior.acceptance.reshape(chains).astype(np.float64), about_acceptance),
     }
     groups = {
-        "posterior": _families(columns, units, result.fixed).assign_coords(chain),
+        "posterior": _families(columns, units, held).assign_coords(chain),
         "sample_stats": xr.Dataset(stats, chain),
         "observed_data": _readings(result.observed, ()),
         "prior": _families({name: values[np.newaxis] for name, values in result.prior.items()}, units),

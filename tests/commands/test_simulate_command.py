@@ -73,6 +73,17 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     for words in ([*drive, "--G", "inf"], [word for word in drive if word not in ("--result", str(tmp_path))]):
         with pytest.raises(InputError, match="--spring needs the result that it is of, and a gap"):
             command.capsule_values(parser.parse_args([*words, "--k2", "2e4", "--spring", "L60"]))
+    # What the folder states is held. Before: level ground, and a drive that reacts on the ground.
+    held = {"reaction": 1.0, "slope": 0.05, "lag": 0.006, "P_off": None}
+    (tmp_path / "parameters.json").write_text(json.dumps({"parameters": rows, "fixed": held}), encoding="utf-8")
+    values = command.capsule_values(parser.parse_args([*drive, "--c", "5"]))
+    assert (values["reaction"], values["slope"], values["k1"]) == (1.0, 0.05, 1500.0)
+    assert command.capsule_values(parser.parse_args([*drive, "--reaction", "0"]))["reaction"] == 0.0
+    pulses = ["--drive", "pulses", "--G", "inf", "--P_on", "1", "--period", "0.1", "--duty", "0.5", *drive[-4:]]
+    with pytest.raises(InputError, match=r"P_off .* must be given"):
+        command.capsule_values(parser.parse_args(pulses))
+    values = command.capsule_values(parser.parse_args([*pulses, "--P_off", "-1"]))
+    assert (values["lag"], values["P_off"]) == (0.006, -1.0)
     other = {"parameters": rows, "provenance": {"friction": "mine.Law"}}
     (tmp_path / "parameters.json").write_text(json.dumps(other), encoding="utf-8")
     with pytest.raises(InputError, match=r"compute with eq. \(1\).*mine.Law"):

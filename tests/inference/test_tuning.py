@@ -11,12 +11,12 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.inference import tuning
-from capsule_id.inference.result import Result
+from capsule_id.inference.result import Result, held_leaves
 from capsule_id.inference.tuning import _fitted, operating_points, score, tune
 from capsule_id.motions.response import Settling
 from capsule_id.motions.sweep import motion_map
 from capsule_id.physics.model import CapsuleParameters, Excitation
-from capsule_id.rig.model import Quantity, Rig
+from capsule_id.rig.model import ModelChoices, Quantity, Rig
 from capsule_id.synthetic import ROBOT, RobotDesign, synthesize, synthesize_robot
 
 TRUTH = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.66, "v_s": 0.3, "k2[soft]": 18960.0}
@@ -196,6 +196,25 @@ def test_operating_points_are_those_of_the_fitted_rig(tmp_path: Path) -> None:
     known = _fitted(fit_of(TRUTH, rig=rig), chosen)
     assert (known["slope"], known["reaction"]) == (0.05, 0.0)
     assert known["m2"] is chosen["m2"]
+
+
+def test_the_leaves_that_a_folder_states(tmp_path: Path) -> None:
+    synthesize(tmp_path / "rig", 3, name="rig", runs=True)
+    rig = read_rig(tmp_path / "rig")
+    masses = {"m1": rig.mass("m1"), "m2": rig.mass("m2")}
+    assert held_leaves(rig) == {**masses, "g": 9.81, "reaction": 0.0, "slope": 0.0, "N0": 0.0}
+    first, second, *_ = (t for t in rig.tables if t.kind == "forced_run")
+
+    def of(*changes: dict[str, Any]) -> dict[str, float | None]:
+        pairs = zip((first, second), changes, strict=True)
+        tables = tuple(replace(t, settings=replace(t.settings, **own)) for t, own in pairs)
+        return held_leaves(replace(rig, tables=tables, slope=Quantity(0.05), model=ModelChoices(reaction="capsule")))
+
+    lag = {"lag": Quantity(0.006)}
+    assert of(lag, lag) == {**held_leaves(rig), "reaction": 1.0, "slope": 0.05, "lag": 0.006}
+    assert of(lag, {"lag": Quantity(0.004)})["lag"] is None
+    assert of({"normal_force": 3.0}, {})["N0"] is None
+    assert of({"drive": "square"}, {})["P_off"] is None
 
 
 def test_a_measured_setting_is_predicted_with_the_fitted_rig_whatever_is_searched(

@@ -97,7 +97,17 @@ def test_figures_are_those_of_the_page_at_150_dpi(folder: Path, drawn: tuple[Pic
 
 def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> None:
     content = _strict((folder / "parameters.json").read_text(encoding="utf-8"))
-    assert list(content) == ["rig", "synthetic", "trust", "not_in_sd", "parameters", "verdict", "records", "provenance"]
+    assert list(content) == [
+        "rig",
+        "synthetic",
+        "trust",
+        "not_in_sd",
+        "parameters",
+        "fixed",
+        "verdict",
+        "records",
+        "provenance",
+    ]
     assert content["rig"] == "twin"
     assert content["synthetic"] is True
     assert list(content["parameters"]) == list(result.summary.index)
