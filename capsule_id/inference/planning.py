@@ -86,7 +86,9 @@ class Candidate:
         e, target = self.template, LogPosterior(self.template.rig, [self.template])
         located = target.located
         rows = [target.parameters[i] for i in located]
-        kept = [row.of != e.label or (row.physical and isinstance(e, PointTest)) for row in rows]
+        # What belongs to the run of a part is new in a new run too.
+        own_names = {e.label, e.shares_noise}
+        kept = [row.of not in own_names or (row.physical and isinstance(e, PointTest)) for row in rows]
         shared = np.array([row.name in names and keep for row, keep in zip(rows, kept, strict=True)])
         place = [names.index(row.name) for row, keep in zip(rows, shared, strict=True) if keep]
         found = np.zeros((len(draws), len(names), len(names)))
@@ -266,7 +268,7 @@ def candidates(
         seen.add(own)
         starts = {name: start.centre for name, start in LogPosterior(e.rig, [e]).starts().items()}
         about = (number, number * each)
-        name = f"as {e.label}" if e.label in own_labels else f"{e.label} as in the synthetic rig"
+        name = f"as {e.label}" if e.shares_noise in own_labels else f"{e.label} as in the synthetic rig"
         if isinstance(e, PointTest):
             for words, changed, rows in _designs(e, kind) if number > isinstance(e, Line) else ():
                 template, strength = _repeated(e, number, rows, changed)

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, Start, Unavailable, ValuesBySymbol
 from capsule_id.experiments.misfit import LOG_2PI
-from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
+from capsule_id.parameters import QUANTILE_975, TABLE, Parameter, Prior, parameter, symbol_of
 from capsule_id.rig.model import Rig
 
 # scales: Scatters of which only the product with other parameters changes the motion.
@@ -127,11 +127,17 @@ def covering_prior(name: str, priors: Sequence[Prior]) -> Prior:
         return Prior("lognormal", float(np.exp(0.5 * (low + high))), float(np.exp(0.5 * (high - low))))
     if kinds == {"normal"} and len(locations) == 1:
         return max(priors, key=lambda prior: prior.spread)
+    row = TABLE.get(symbol_of(name))
+    other = (
+        f"state {name} in [prior]"
+        if row is None or row.prior_can_be_stated
+        else f"fit those with another {name} in folders of their own"
+    )
     stated = " and ".join(dict.fromkeys(f"{prior.kind} {prior.location:g}, {prior.spread:g}" for prior in priors))
     raise InputError(
         f"experiments that share {name} must state one prior for it",
         f"{stated} (SI)",
-        f"state the same in each of them, or state {name} in [prior]",
+        f"state the same in each of them, or {other}",
     )
 
 

@@ -13,6 +13,7 @@ from scipy import integrate
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
+from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference import planning
 from capsule_id.inference.least_squares import linearised
@@ -22,6 +23,8 @@ from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Instrument, Quantity, Rig
 from capsule_id.synthetic import PAPER, Truth, synthesize
 from tests.cli_tools import DATA
+from tests.experiments import bench
+from tests.forced_runs import table
 
 #: Posterior sds of the logarithms.
 SD = {"m1": 2e-3, "m2": 1e-3, "k1": 2e-3, "c": 3e-3, "mu": 9e-3, "v_s": 8e-2, "K": 1e-2}
@@ -132,6 +135,21 @@ def test_a_settled_run_tells_what_the_likelihood_of_a_run_does() -> None:
 
 def row_of(plan: Plan, what: str) -> Any:
     return plan.table[plan.table["what"] == what].iloc[0]
+
+
+def test_a_part_of_a_run_leaves_the_drive_of_a_new_run_as_unknown_as_the_whole_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before: phase, amplitude and gap of the old record counted as those of the new run, which told more than they can."""
+    own = table(1, samples=400)
+    part = ForcedRun(own, bench.rig(own)).parts(0.2)[0]
+    assert part.label != part.shares_noise == own.label
+    target = LogPosterior(part.rig, [part])
+    names = [target.names[i] for i in target.located]
+    monkeypatch.setattr(Candidate, "_of_run", lambda _, target, draws: [np.eye(len(names))])
+    (found,) = Candidate(part, "", 1, 1.0, 1.0, {}, {}).information([{}], names)
+    known = {name for name, diagonal in zip(names, np.diag(found), strict=True) if diagonal > 0.0}
+    assert known == {"k1", "c", "mu", "v_s", "K", "k2[stiff]", "m1", "m2"} & set(names)
 
 
 def test_the_best_test_is_one_that_reads_the_target(rig: Rig) -> None:

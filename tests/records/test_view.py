@@ -1,5 +1,6 @@
 """The view of a record: filter, Poincaré points, force; figures; the lines of ``capsule-id check``."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -9,11 +10,13 @@ import pytest
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
+from capsule_id.records.tones import Harmonic, recorded_drive
 from capsule_id.records.view import SMALLEST_RATE_GAIN, Gains, RecordView, RunRecord, describe_run, view_record
 from capsule_id.report.figures.fits import channel_history, force_on_rod, overview, overview_size, phase_plane
 from capsule_id.report.figures.style import new_axes, new_figure, png
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import filter_gain
+from capsule_id.rig.model import Quantity
 from tests.experiments import bench
 from tests.records.runs import Known, noisier, reference, table_of
 
@@ -113,7 +116,16 @@ def test_check_says_it_in_a_few_lines(case: Known) -> None:
     assert wrong.level == "warn"
     text = finding_text(wrong, messages_of(KINDS))
     assert "stated 80 rad/s, the current has 73.5" in text
-    assert "Correct Omega." in text
+    assert "Correct Omega; or" in text
+    # Off by 0.2 %. With a stated error of the clock the fit measures the clock by it; before, "correct Omega" hid that.
+    near = table_of(noisier(case.run, 1.0, 0), Omega=73.5)
+    off = cast(Harmonic, recorded_drive(near)).Omega / 73.5 - 1.0
+    own = table_of(noisier(case.run, 1.0, 0), Omega=73.5 * (1.0 + off) / 1.002)
+    (named,) = lint_run(own, bench.rig())
+    text = finding_text(named, messages_of(KINDS))
+    assert re.search(r"clock = \{ drift = \{ value = (199\d|200\d), sd = \.\.\., unit = \"ppm\" \} \}", text)
+    assert list(lint_run(replace(own, drift=Quantity(0.0, 1e-3)), bench.rig())) == []
+    assert list(lint_run(replace(own, drift=Quantity(0.0, 1e-5)), bench.rig())) != []
 
 
 def test_check_says_why_it_cannot_tell(case: Known) -> None:

@@ -13,7 +13,7 @@ from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.lint import USUAL, lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, OF_DERIVATIVE, SIGN_ERRORS, derivative_ratio, drive_power, phasor
-from capsule_id.records.tones import FEWEST_IN_PERIOD, recorded_drive, stated_Omega
+from capsule_id.records.tones import FEWEST_IN_PERIOD, SIGNIFICANT, recorded_drive, stated_Omega
 from capsule_id.records.view import describe_run
 from capsule_id.rig.filters import median_step, uneven_sampling
 from capsule_id.rig.model import Column, Quantity, Rig, Table
@@ -196,8 +196,10 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         drive = recorded_drive(table)
     except InputError:
         return
-    if drive is not None and drive.disagrees:
-        facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd}
+    off = 0.0 if drive is None else drive.Omega / drive.stated_Omega - 1.0
+    # A fit with a stated sd of the clock measures the clock by the frequency of the drive.
+    if drive is not None and drive.disagrees and abs(off) > SIGNIFICANT * table.drift.sd:
+        facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd, "ppm": 1e6 * off}
         yield Finding("runs.frequency", "warn", facts, table.label)
 
 
@@ -246,7 +248,9 @@ LINT_MESSAGES = {
         "frequency of the drive",
         warn=(
             "the stated Omega must be that of the current; stated {stated:g} rad/s, the current has {Omega:.6g} ± {sd:.2g} "
-            "rad/s. Correct Omega."
+            "rad/s on the clock of the record. Correct Omega; or, where the generator is known to be right, the clock of the "
+            "logger is off by {ppm:.0f} ppm, in the decays too: state its drift, clock = {{ drift = {{ value = {ppm:.0f}, sd = "
+            '..., unit = "ppm" }} }}.'
         ),
     ),
     "runs.time_scale": Message(
