@@ -10,8 +10,10 @@ from capsule_id.experiments.forced_run.experiment import better_start
 from capsule_id.experiments.forced_run.start_state import parts_of
 from capsule_id.experiments.kind import make_experiments
 from capsule_id.inference.target import LogPosterior
+from capsule_id.parameters import Prior
 from capsule_id.physics.simulation import simulate
 from capsule_id.rig.model import Quantity, Table
+from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.forced_runs import make, recorded, table, theta
 
@@ -33,6 +35,24 @@ def test_parts_are_the_record_and_share_what_is_the_records() -> None:
     # Only the first part proposes where what they share may start: phases must not be averaged.
     assert "phase[run_1]" not in runs[1].starts()
     assert set(LogPosterior(bench.rig(whole), runs).starts()) == set.union(*names)
+
+
+def test_parts_have_one_gain_and_one_clock() -> None:
+    """Before: both were drawn anew in each part, so that in nine parts their mean had a third of the stated sd."""
+    ticks = (Finding("times.ticks", "ok", {}, "run_1"),)
+    whole = replace(table(0, samples=600, segment=0.2, x_rel_gain_sd=0.02), findings=ticks, drift=Quantity(0.0, 1e-4))
+    runs = [e for e in make_experiments(bench.rig(whole)) if isinstance(e, ForcedRun)]
+    assert len(runs) == 3
+    for e in runs:
+        rows = {row.name: row.prior for row in e.parameters}
+        assert rows["gain[run_1_x_rel]"] == Prior("normal", 0.0, 0.02)
+        assert rows["clock_drift[run_1]"] == Prior("normal", 0.0, 1e-4)
+        assert e.channels[e.names.index("x_rel")].gain_sd is None
+        known = {**theta(), "gain[run_1_x_rel]": 0.05}
+        assert e.instrument("x_rel", known)[0] == 1.05
+    # A record in one part integrates its gain out.
+    (one,) = make_experiments(bench.rig(replace(whole, settings=replace(whole.settings, segment=None))))
+    assert not any(row.symbol == "gain" for row in one.parameters)
 
 
 def test_parts_of_a_part_belong_to_the_record() -> None:

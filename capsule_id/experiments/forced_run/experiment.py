@@ -44,7 +44,7 @@ from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.forces import equilibrium
 from capsule_id.physics.model import CapsuleParameters, Drive, Excitation, Trajectory, rod_acceleration
 from capsule_id.records.tones import stated_Omega
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Instrument, Quantity, Rig, Table
 from capsule_id.views import Facts, Finding
 
 # channel: A recorded channel of a run, and the errors of its sensor.
@@ -209,7 +209,8 @@ class CapsuleRun(CapsuleForward):
         of, whole, settings = self.label, self.about.record, self.table.settings
         rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
         rows += free_parameters(self.rig, damped=self.spring is not None and self.friction.contact is None)
-        rows += [*clock_parameters(self.table, self.rig), *instrument_parameters(self.table)]
+        # All parts were read by one clock.
+        rows += [*clock_parameters(replace(self.table, label=whole), self.rig), *instrument_parameters(self.table)]
         rows += support_parameters(self.table, self.friction, whole)
         if "current" in self.names:
             amplitude = 0.5 * float(np.ptp(self.table["current"]))
@@ -263,7 +264,7 @@ class CapsuleRun(CapsuleForward):
 
     def parts(self, seconds: float) -> "tuple[CapsuleRun, ...]":
         """Divide the record into parts of about ``seconds``; return the run itself if it is not longer."""
-        tables = parts_of(self.table, seconds)
+        tables = parts_of(_with_sampled_gains(self.table, self.about.record), seconds)
         own = (
             self.remade(table, capsule_rate=None, leads=self.about.leads and i == 0) for i, table in enumerate(tables)
         )
@@ -532,3 +533,17 @@ def _misses(run: CapsuleRun, theta: ValuesBySymbol, x: np.ndarray, Y1: np.ndarra
             miss = (channel.values - seen_by * model) / theta[f"noise_{channel.name}"]
             parts.append(miss - np.mean(miss, axis=1, keepdims=True))
     return np.concatenate(parts, axis=1)
+
+
+def _with_sampled_gains(table: Table, record: str) -> Table:
+    """``table`` with an instrument for each column of a stated gain: all parts of a record have one gain, which is sampled.
+
+    Integrated out in each part, its error would be drawn anew and average out.
+    """
+    columns, changed = dict(table.columns), dict[str, None]()
+    for name, column in table.columns.items():
+        sd = getattr(table.settings, f"{name}_gain_sd", None)
+        if sd is not None and column.instrument is None:
+            own = Instrument(f"{record}_{name}", errors={"gain": Quantity(0.0, sd)})
+            columns[name], changed[f"{name}_gain_sd"] = replace(column, instrument=own), None
+    return replace(table, columns=columns, settings=replace(table.settings, **changed)) if changed else table
