@@ -139,6 +139,9 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
             warnings.showwarning = partial(_show_warning, program)
             if "no_cache" in args:  # a command that computes with JAX, which nothing has imported yet
                 prepare_jax(not args.no_cache)
+            # bifurcate reads its seed as it reads the other numbers of a sweep.
+            if isinstance(getattr(args, "seed", None), int) and args.seed < 0:
+                raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
             return args.run(args)
     except OutputError:
         raise

@@ -16,7 +16,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import chdir, contextmanager, suppress
+from contextlib import AbstractContextManager, chdir, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -258,7 +258,7 @@ def fit_stages(sampled: bool) -> dict[str, float]:
     return {name: share for name, share in FIT_STAGES.items() if sampled or name not in ("burn-in", "sampling")}
 
 
-class Progress:
+class Progress(AbstractContextManager["Progress"]):
     """Stage, share done and time left: a bar on a terminal or in a notebook, a line every ``FILE_INTERVAL`` in a file.
 
     The share never falls and the time left never rises while one bar lasts.
@@ -278,9 +278,6 @@ class Progress:
         self._stage, self._began, self._shown = "", 0.0, 0.0
         self._first, self._share, self._left = 0.0, 2.0, math.inf
         self._open = self._displayed = False
-
-    def __enter__(self) -> "Progress":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._end_line()

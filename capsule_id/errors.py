@@ -90,12 +90,6 @@ class FolderError(InputError):
         return "\n".join([*map(text, self.errors[:MOST_SHOWN]), *more])
 
 
-def check_seed(seed: int) -> None:
-    """Refuse a negative ``--seed``."""
-    if seed < 0:
-        raise InputError("--seed must not be negative", str(seed), "give 0 or more")
-
-
 class OutputError(OSError):
     """A folder, a file or standard output takes no more. A command prints it in one line and returns exit code 1."""
 

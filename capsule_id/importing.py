@@ -385,15 +385,20 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
         ]
         return "\n".join(lines) + "\n"
     kind = kinds[guessed.kind]
-    lines = [*unread, *_unused_lines(found, guessed, kind)]
-    lines += ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
-    lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
-    lines += _layout_lines(found)
-    lines += [
+    labels = (
         _commented(line, "unsure" if UNKNOWN in line else "likely", why) for line, why in lines_of_labels(found, kind)
+    )
+    lines = [
+        *unread,
+        *_unused_lines(found, guessed, kind),
+        "[[experiment]]",
+        _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason),
+        _commented(f"file = {json.dumps(file)}", "sure", _description(found, content)),
+        *_layout_lines(found),
+        *labels,
+        *_setting_lines(found, guessed, kind),
+        *_column_lines(found, guessed, kind),
     ]
-    lines += _setting_lines(found, guessed, kind)
-    lines += _column_lines(found, guessed, kind)
     return "\n".join(lines) + "\n"
 
 

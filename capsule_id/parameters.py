@@ -63,13 +63,12 @@ class Prior:
 
     def describe(self) -> str:
         """One phrase for tables, SI."""
-        if self.kind == "lognormal":
-            return f"log-normal, median {self.location:g}, factor {self.spread:g}"
-        if self.kind == "halfnormal":
-            return f"half-normal, scale {self.spread:g}"
-        if self.kind == "positive_normal":
-            return f"weighed: {self.location:g} ± {self.spread:g}"
-        return f"normal, {self.location:g} ± {self.spread:g}"
+        return {
+            "lognormal": f"log-normal, median {self.location:g}, factor {self.spread:g}",
+            "halfnormal": f"half-normal, scale {self.spread:g}",
+            "positive_normal": f"weighed: {self.location:g} ± {self.spread:g}",
+            "normal": f"normal, {self.location:g} ± {self.spread:g}",
+        }[self.kind]
 
 
 class Name(NamedTuple):

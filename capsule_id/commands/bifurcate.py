@@ -321,13 +321,14 @@ def _axis(prefix: str, name: str, begin: str, end: str, unit: str | None, points
     if not low < high:
         raise InputError(f"--{prefix}from must be less than --{prefix}to", f"{low:g} and {high:g}", "swap them")
     n = whole_number(f"{prefix}points", points)
-    if not 2 <= n <= MOST_POINTS:
-        raise InputError(f"--{prefix}points must lie between 2 and {MOST_POINTS}", points, "give e.g. 500")
-    positive = SWEPT[name].sign == "positive" or name in ("Omega", "f")
-    if positive and not low > 0.0:
-        raise InputError(f"{name} must be positive", f"--{prefix}from {low:g}", "begin above 0")
-    if SWEPT[name].sign == "not negative" and low < 0.0:
-        raise InputError(f"{name} must not be negative", f"--{prefix}from {low:g}", "begin at 0 or above")
+    sign, begins = "positive" if name in ("Omega", "f") else SWEPT[name].sign, f"--{prefix}from {low:g}"
+    for holds, rule, value, remedy in (
+        (2 <= n <= MOST_POINTS, f"--{prefix}points must lie between 2 and {MOST_POINTS}", points, "give e.g. 500"),
+        (sign != "positive" or low > 0.0, f"{name} must be positive", begins, "begin above 0"),
+        (sign != "not negative" or low >= 0.0, f"{name} must not be negative", begins, "begin at 0 or above"),
+    ):
+        if not holds:
+            raise InputError(rule, value, remedy)
     return Axis(name, np.linspace(low, high, n) * factor, si if unit is None else unit, factor)
 
 
@@ -395,7 +396,7 @@ def overlay(
     over: str,
     x: Sequence[float] | np.ndarray,
     values: Mapping[str, float],
-    fitted: Mapping[str, float],
+    fitted: Mapping[str, float | None],
     spring: str | None = None,
 ) -> "tuple[list[MeasuredPoint], str]":
     """Runs of ``rig`` with the settings of a diagram, as its points; and a text: how many, and why others are left out.
@@ -414,7 +415,8 @@ def overlay(
 
     def known(name: str) -> Quantity:
         """The fitted value, the paper's estimate, or the stated prior: VISIBLE sds are its 95 % range."""
-        value, measured = (fitted[name], True) if name in fitted else estimate(name)
+        seen = fitted.get(name)
+        value, measured = estimate(name) if seen is None else (seen, True)
         prior = rig.priors.get(name)
         if measured or prior is None or prior.kind != "lognormal":
             # A default prior (factor 1000) is too broad for a comparison.

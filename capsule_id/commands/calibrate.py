@@ -19,7 +19,7 @@ from capsule_id.commands.bifurcate import client_of
 from capsule_id.commands.fit import CLEAN, DEFAULT_ESS, DEFAULT_MAX_STEPS, FAILED, NOT_CLEAN, each_result, fit_by_worker
 from capsule_id.commands.synthesize import assignment
 from capsule_id.console import Progress, complain, one_line, refusing_damage, say, stop_if_interrupted
-from capsule_id.errors import InputError, check_seed
+from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
 from capsule_id.output import replace_file, replace_files
 from capsule_id.parameters import QUANTILE_975, Prior
@@ -55,7 +55,6 @@ def run(args: Namespace) -> int:
     InputError
         If an option is wrong, or DIR holds something else or was begun with other options; then nothing is written.
     """
-    check_seed(args.seed)
     if args.rigs < 1:
         raise InputError("--rigs must be positive", str(args.rigs), "give 1 or more")
     from capsule_id.inference.pipeline import PACKAGES, package_versions

@@ -60,12 +60,16 @@ def _checked(args: argparse.Namespace) -> str:
     if args.json:
         tables, told = [_columns(table) for table in rig.tables], [_told(each, rig, messages) for each in findings]
         return _as_json(rig=rig.name, synthetic=rig.synthetic, tables=tables, findings=told)
-    lines = [f"{rig.name}: {counted(len(rig.tables), 'experiment')}{', SYNTHETIC data' if rig.synthetic else ''}"]
-    lines += [_summary(table) for table in rig.tables]
-    lines += [f"{table.label}: {line}" for table in rig.tables for line in kinds[table.kind].describe(table)]
-    lines += [f"{finding.level}: {finding_text(finding, messages)}" for finding in findings]
-    lines += [*drawn, counted(len(findings), "finding") if findings else "no findings"]
-    return "\n".join(lines)
+    return "\n".join(
+        [
+            f"{rig.name}: {counted(len(rig.tables), 'experiment')}{', SYNTHETIC data' if rig.synthetic else ''}",
+            *map(_summary, rig.tables),
+            *(f"{table.label}: {line}" for table in rig.tables for line in kinds[table.kind].describe(table)),
+            *(f"{finding.level}: {finding_text(finding, messages)}" for finding in findings),
+            *drawn,
+            counted(len(findings), "finding") if findings else "no findings",
+        ]
+    )
 
 
 def _as_json(**content: Any) -> str:
@@ -112,16 +116,15 @@ def _draw(rig: Rig, findings: Sequence[Finding], folder: Path) -> list[str]:
     InputError
         If the folder cannot be written.
     """
-    from capsule_id.report.figures.fits import readings_figure
-    from capsule_id.report.figures.style import mark, own_style, png
+    from capsule_id.report.figures import fits, style
 
-    with refusing("--figures DIR must be writable", "name another one", folder), own_style():
+    with refusing("--figures DIR must be writable", "name another one", folder), style.own_style():
         folder.mkdir(parents=True, exist_ok=True)
         for table in rig.tables:
-            figure = readings_figure(table, [found for found in findings if found.experiment == table.label])
+            figure = fits.readings_figure(table, [found for found in findings if found.experiment == table.label])
             if rig.synthetic:
-                mark(figure, "SYNTHETIC")
-            write_file(folder / f"{table.label}.png", png(figure))
+                style.mark(figure, "SYNTHETIC")
+            write_file(folder / f"{table.label}.png", style.png(figure))
     return [f"figures: {len(rig.tables)} in {folder}"]
 
 

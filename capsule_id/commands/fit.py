@@ -1,6 +1,5 @@
 """``fit-params DATA``: from one rig folder or several to parameters, posterior and report."""
 
-import argparse
 import shlex
 import sys
 import time
@@ -27,7 +26,7 @@ from capsule_id.console import (
     say,
     stop_if_interrupted,
 )
-from capsule_id.errors import InputError, check_seed
+from capsule_id.errors import InputError
 from capsule_id.experiments.kind import CHOICES, Registry, default_registry, make_experiments
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress, write_file
 from capsule_id.report.messages import messages_of
@@ -292,7 +291,7 @@ OPTIONS = {
 }
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: Namespace) -> int:
     """Fit and write; return 0 for a clean verdict, else 3. See ``fit_many`` for several rigs.
 
     Raises
@@ -300,7 +299,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If the input is bad; then nothing is written.
     """
-    check_seed(args.seed)
     for option, value in (("--max-steps", args.max_steps), ("--ess", args.ess)):
         if value < 1:
             raise InputError(f"{option} must be positive", str(value), "give 1 or more")
@@ -327,12 +325,20 @@ def run(args: argparse.Namespace) -> int:
         return fit_one(rigs[0], args, directory, kinds, progress)
 
 
-def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> int:
+def _compare(args: Namespace, rigs: Sequence[Rig], kinds: Registry) -> int:
     """Print the comparison of models; 0."""
     if len(rigs) > 1:
         raise InputError("--compare takes one rig", counted(len(rigs), "rig"), "name one folder")
-    unused = {"out": None, "scheduler": None, "profile": None, "json": False, "resume": False}
-    unused |= {"experiments": "all", "max_steps": DEFAULT_MAX_STEPS, "ess": DEFAULT_ESS}
+    unused = {
+        "out": None,
+        "scheduler": None,
+        "profile": None,
+        "json": False,
+        "resume": False,
+        "experiments": "all",
+        "max_steps": DEFAULT_MAX_STEPS,
+        "ess": DEFAULT_ESS,
+    }
     ignored = [f"--{name}" for name, default in unused.items() if getattr(args, name) != default]
     if ignored:
         names = ", ".join(ignored).replace("_", "-")

@@ -8,7 +8,7 @@ from capsule_id.commands import NO_CACHE, PATH, QUIET
 from capsule_id.commands.predict import check_new_files, say_failed, write_new_files
 from capsule_id.commands.simulate import number, whole_number
 from capsule_id.console import Progress, say
-from capsule_id.errors import InputError, check_seed
+from capsule_id.errors import InputError
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
@@ -40,27 +40,21 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If RESULT is none or holds no sample, a parameter is unknown, the time is too short, or a file exists.
     """
-    check_seed(args.seed)
     check_new_files(args)
     minutes, draws = number("minutes", args.minutes), whole_number("draws", args.draws, 1)
     if minutes <= 0.0:
         raise InputError("--minutes must be positive", args.minutes, "give the time for the tests")
-    from capsule_id.report.figures import fits, style
+    from capsule_id.report.figures import fits
 
     result = cid.load(args.result)
     say_failed(result)
     targets = [name.strip() for name in args.targets.split(",") if name.strip()]
     with Progress(not args.quiet, unit="test") as progress:
         found = result.next_tests(targets, minutes=minutes, draws=draws, seed=args.seed, progress=progress)
-    written = [("--out", args.out, found.table.to_csv(float_format="%.6g", lineterminator="\n").encode())]
-    if args.figure is not None:
-        with style.own_style():
-            figure = fits.expected_sds(
-                found.table, list(found.today), f"{result.rig.name}, {result.trust}: {minutes:g} min"
-            )
-            written.append(("--figure", args.figure, style.png(figure, result.rig.synthetic)))
     say(_summary(found, {name: result[name].unit for name in found.today}))
-    write_new_files([one for one in written if one[1] is not None])
+    table, title = found.table, f"{result.rig.name}, {result.trust}: {minutes:g} min"
+    written = table.to_csv(float_format="%.6g", lineterminator="\n")
+    write_new_files(args, written, lambda: fits.expected_sds(table, list(found.today), title), result.rig.synthetic)
     return 0 if result.clean else 3
 
 

@@ -5,7 +5,6 @@ import argparse
 from capsule_id.commands import NO_CACHE
 from capsule_id.commands.simulate import whole_number
 from capsule_id.console import say
-from capsule_id.errors import check_seed
 from capsule_id.parameters import is_stated
 from capsule_id.views import counted
 
@@ -27,7 +26,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If rig.toml breaks a rule or plans nothing.
     """
-    check_seed(args.seed)
     draws = whole_number("draws", args.draws, 1)
     from capsule_id.experiments.kind import default_registry
     from capsule_id.inference.planning import planned

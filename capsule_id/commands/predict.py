@@ -1,13 +1,13 @@
 """``capsule-id predict RESULT SETTINGS``: displacements at new settings, from a result with a progression."""
 
 import argparse
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
 import capsule_id as cid  # imports JAX at the first use of a name
 from capsule_id.commands import NO_CACHE, PATH
 from capsule_id.console import say
-from capsule_id.errors import InputError, check_seed, refusing
+from capsule_id.errors import InputError, refusing
 from capsule_id.output import replace_file
 from capsule_id.views import counted
 
@@ -31,35 +31,40 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If RESULT is none, holds no sample or no progression, the settings break a rule, or a file exists.
     """
-    check_seed(args.seed)
     check_new_files(args)
     from capsule_id.inference.prediction import predict
-    from capsule_id.report.figures import fits, style
+    from capsule_id.report.figures import fits
 
     result = cid.load(args.result)
     say_failed(result)
     made = predict(result, args.settings, seed=args.seed)
-    table = made.table.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode()
-    written = [("--out", args.out, table)]
-    if args.figure is not None:
-        with style.own_style():
-            written.append(("--figure", args.figure, style.png(fits.side_by_side(made.panels))))
-    write_new_files(written, f": {counted(len(made.table), 'setting')}")
+    table = made.table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    about = f": {counted(len(made.table), 'setting')}"
+    write_new_files(args, table, lambda: fits.side_by_side(made.panels), about=about)
     return 0 if result.clean else 3
 
 
-def write_new_files(written: Sequence[tuple[str, Path, bytes]], about: str = "") -> None:
-    """Write option, file and content of ``--out``, then of ``--figure``, and print the names; ``about`` the first.
+def write_new_files(
+    args: argparse.Namespace, table: str, draw: Callable[[], Any], synthetic: bool = False, about: str = ""
+) -> None:
+    """Write ``table`` to ``--out``, then what ``draw`` makes to ``--figure``, and print the names; ``about`` the first.
+
+    synthetic : the figure says that its data are
 
     Raises
     ------
     InputError
         If a file cannot be written.
     """
-    for option, file, content in written:
-        with refusing(f"{option} must be writable", "name another file", file):
-            replace_file(file, content)
-        say(f"wrote {file}{about if option == '--out' else ''}")
+    from capsule_id.report.figures import style
+
+    with style.own_style():
+        figure = b"" if args.figure is None else style.png(draw(), synthetic)
+    for option, file, content in (("--out", args.out, table), ("--figure", args.figure, figure)):
+        if file is not None:
+            with refusing(f"{option} must be writable", "name another file", file):
+                replace_file(file, content)
+            say(f"wrote {file}{about if option == '--out' else ''}")
 
 
 def say_failed(result: "cid.Fit") -> None:

@@ -40,9 +40,13 @@ def capsule_options(defaults: Mapping[str, float] = DEFAULTS) -> Mapping[str, Se
         drives = [drive for drive, names in DRIVES.items() if name in names]
         only = f"; {drives[0]} drive" if len(drives) == 1 else ""
         rows.append((f"--{name}", "X", f"{leaf.meaning}, {leaf.unit} ({text}{only})"))
-    rows.append(("--result", "DIR", "result directory of fit-params, for its fitted parameters", PATH))
-    rows.append(("--spring", "NAME", "support spring of --result"))
-    return {"parameters: plain numbers in SI units": rows}
+    return {
+        "parameters: plain numbers in SI units": [
+            *rows,
+            ("--result", "DIR", "result directory of fit-params, for its fitted parameters", PATH),
+            ("--spring", "NAME", "support spring of --result"),
+        ]
+    }
 
 
 def capsule_values(

@@ -4,7 +4,7 @@ import argparse
 
 from capsule_id.commands import PATH
 from capsule_id.console import say
-from capsule_id.errors import InputError, check_seed, refusing
+from capsule_id.errors import InputError, refusing
 
 OPTIONS = {
     "": (
@@ -26,7 +26,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If DIR is not empty, or a value cannot be set.
     """
-    check_seed(args.seed)
     from capsule_id.experiments.kind import default_registry
     from capsule_id.synthetic import ROBOT, Truth, synthesize, synthesize_robot
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from functools import partial
 from typing import TYPE_CHECKING
 
 import capsule_id as cid  # imports JAX at the first use of a name
@@ -9,7 +10,7 @@ from capsule_id.commands import NO_CACHE, PATH, QUIET
 from capsule_id.commands.predict import check_new_files, say_failed, write_new_files
 from capsule_id.commands.simulate import number, whole_number
 from capsule_id.console import Progress, say
-from capsule_id.errors import InputError, check_seed
+from capsule_id.errors import InputError
 from capsule_id.parameters import LEAVES
 from capsule_id.views import counted
 
@@ -47,7 +48,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If RESULT is none or holds no sample, a setting is not admissible or missing, or a file exists.
     """
-    check_seed(args.seed)
     check_new_files(args)
     if args.out.suffix not in (".csv", ".json"):
         raise InputError("--out must end in .csv or .json", args.out.name, "change the suffix", args.out)
@@ -62,28 +62,38 @@ def run(args: argparse.Namespace) -> int:
             given[name] = values[0]
     faster_than = None if args.faster_than is None else number("faster-than", args.faster_than)
     draws = whole_number("draws", args.draws, 1)
-    from capsule_id.report.figures import style, sweeps
+    from capsule_id.report.figures import sweeps
 
     result = cid.load(args.result)
     say_failed(result)
     with Progress(not args.quiet, unit="setting") as progress:
-        options = {"faster_than": faster_than, "spring": args.spring, "draws": draws, "seed": args.seed}
-        found = result.tune(bounds, given, **options, progress=progress)
+        found = result.tune(
+            bounds,
+            given,
+            faster_than=faster_than,
+            spring=args.spring,
+            draws=draws,
+            seed=args.seed,
+            progress=progress,
+        )
     frames = {name: getattr(found, name) for name in ("table", "motions", "sensitivity")}
-    saved = {name: json.loads(frame.to_json(orient="index")) for name, frame in frames.items()}
-    saved |= {"best": found.best, "bounds": bounds, "given": given, "seed": args.seed, "draws": draws}
-    saved |= {"failed checks": result.failed, "rig": result.rig.name, "synthetic": result.rig.synthetic}
+    saved = {
+        **{name: json.loads(frame.to_json(orient="index")) for name, frame in frames.items()},
+        "best": found.best,
+        "bounds": bounds,
+        "given": given,
+        "seed": args.seed,
+        "draws": draws,
+        "failed checks": result.failed,
+        "rig": result.rig.name,
+        "synthetic": result.rig.synthetic,
+    }
     table = found.table.to_csv(float_format="%.6g", lineterminator="\n")
-    written = [
-        ("--out", args.out, (table if args.out.suffix == ".csv" else json.dumps(saved, indent=1) + "\n").encode())
-    ]
-    if args.figure is not None:
-        trust = str(found.table["trust"].iloc[0])
-        with style.own_style():
-            figure = sweeps.tuned(found.surface, found.best, found.points, f"{result.rig.name}, {trust}:")
-            written.append(("--figure", args.figure, style.png(figure, result.rig.synthetic)))
+    written = table if args.out.suffix == ".csv" else json.dumps(saved, indent=1) + "\n"
     say(_summary(found))
-    write_new_files(written)
+    title = f"{result.rig.name}, {found.table['trust'].iloc[0]}:"
+    draw = partial(sweeps.tuned, found.surface, found.best, found.points, title)
+    write_new_files(args, written, draw, result.rig.synthetic)
     return 0 if result.clean else 3
 
 
@@ -92,22 +102,19 @@ def _summary(found: "Tuning") -> str:
     best, share = found.table.iloc[0], found.motions["share"]
     settings = ", ".join(f"{name} = {value:.4g} {LEAVES[name].unit}" for name, value in found.best.items())
     interval = f"95 %: {best['lower [mm/s]']:.3g} to {best['upper [mm/s]']:.3g}"
-    lines = [
-        f"best of {counted(found.computed, 'setting')}: {settings}",
-        f"mean velocity {best['predicted [mm/s]']:.3g} mm/s ({interval}), {best['trust']}",
-        *(f"{name} is best at an end of its range: search a wider one" for name in found.at_bound),
-    ]
-    if found.failed:
-        lines.append(f"{counted(found.failed, 'setting')} left out: the motion of a draw could not be computed")
-    lines.append(
-        f"settled motions of this setting, by share of draws and initial states ({counted(len(share), 'kind')}):"
+    left_out = f"{counted(found.failed, 'setting')} left out: the motion of a draw could not be computed"
+    measured = found.table.iloc[1:].sort_values("predicted [mm/s]", ascending=False).iloc[:, :-1]
+    points = f"measured operating points, the best prediction first:\n{measured.to_string(float_format='%.4g')}"
+    return "\n".join(
+        [
+            f"best of {counted(found.computed, 'setting')}: {settings}",
+            f"mean velocity {best['predicted [mm/s]']:.3g} mm/s ({interval}), {best['trust']}",
+            *(f"{name} is best at an end of its range: search a wider one" for name in found.at_bound),
+            *([left_out] if found.failed else []),
+            f"settled motions of this setting, by share of draws and initial states ({counted(len(share), 'kind')}):",
+            found.motions.head(MOST_MOTIONS).to_string(float_format="%.3g"),
+            "mean velocity where one parameter or setting changes, mm/s:",
+            found.sensitivity.to_string(float_format="%.4g"),
+            *([points] if len(measured) else []),
+        ]
     )
-    lines.append(found.motions.head(MOST_MOTIONS).to_string(float_format="%.3g"))
-    lines.append("mean velocity where one parameter or setting changes, mm/s:")
-    lines.append(found.sensitivity.to_string(float_format="%.4g"))
-    if len(found.table) > 1:
-        measured = found.table.iloc[1:].sort_values("predicted [mm/s]", ascending=False)
-        lines.append(
-            f"measured operating points, the best prediction first:\n{measured.iloc[:, :-1].to_string(float_format='%.4g')}"
-        )
-    return "\n".join(lines)

@@ -73,8 +73,12 @@ def support_parameters(table: Table, friction: FrictionModel, of: str) -> list[P
     """The parameters of the springs in front of the rod and behind it, and of their gaps of the record ``of``."""
     s = table.settings
     back = [] if s.spring_back in (None, s.spring) else [parameter("k2", s.spring_back)]
-    gaps = [*stated_parameters("G", s.gap, of), *stated_parameters("G_back", s.gap_back, of)]
-    return [*friction.support(s.spring), *back, *gaps]
+    return [
+        *friction.support(s.spring),
+        *back,
+        *stated_parameters("G", s.gap, of),
+        *stated_parameters("G_back", s.gap_back, of),
+    ]
 
 
 def lag_parameters(table: Table, rig: Rig) -> list[Parameter]:

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import special
-from scipy.optimize import root_scalar
+from scipy import optimize, special
 
 from capsule_id.experiments.base import LEVEL, Fitted
 from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
@@ -211,7 +210,7 @@ def _next_step(value: np.ndarray, largest: float) -> float:
 
     if effective(largest) >= KEPT:
         return largest
-    return max(root_scalar(lambda step: effective(step) - KEPT, bracket=(0.0, largest)).root, SAME)
+    return max(optimize.root_scalar(lambda step: effective(step) - KEPT, bracket=(0.0, largest)).root, SAME)
 
 
 def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:

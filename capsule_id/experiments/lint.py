@@ -245,16 +245,22 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     tables : tables of ``rig`` that are fitted together
     """
     exact = (name for name, mass in (("m1", rig.m1), ("m2", rig.m2)) if mass is not None and mass.sd == 0.0)
-    findings = [Finding("masses.exact", "warn", {"name": name}) for name in exact]
-    findings += (*lint_rig_quantities(rig), *lint_magnitudes(tables, kinds, rig))
+    findings = [
+        *(Finding("masses.exact", "warn", {"name": name}) for name in exact),
+        *lint_rig_quantities(rig),
+        *lint_magnitudes(tables, kinds, rig),
+    ]
     for table in tables:
-        findings += lint_stated_sd(table, kinds[table.kind])
         findings += [
-            Finding("readings.encoding", "ok", {"file": file, "encoding": encoding}, table.label)
-            for file, encoding in table.encodings.items()
-            if encoding == WINDOWS
+            *lint_stated_sd(table, kinds[table.kind]),
+            *(
+                Finding("readings.encoding", "ok", {"file": file, "encoding": encoding}, table.label)
+                for file, encoding in table.encodings.items()
+                if encoding == WINDOWS
+            ),
+            *_missing(table),
+            *(replace(found, experiment=table.label) for found in table.findings),
         ]
-        findings += (*_missing(table), *(replace(found, experiment=table.label) for found in table.findings))
         facts = {"file": table.file, "rows": table.rejected, "used": len(table.rows)}
         findings += [Finding("readings.rejected", "warn", facts, table.label)] * bool(table.rejected)
         for lint_table in kinds[table.kind].lint:
@@ -471,8 +477,14 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
         begin, end = float(table["time"][first]), float(table["time"][min(last, used.stop - 1)])
         # An early burst is left out with what is before it.
         key, cut = ("start", end) if burst.start < KEPT_PERIODS * period / step else ("stop", begin)
-        place = {"column": name, "begin": begin, "end": end, "key": key, "value": _rounded(table, used, cut)}
-        facts = {**place, "cut": _cut(table, used, key, cut)}
+        facts = {
+            "column": name,
+            "begin": begin,
+            "end": end,
+            "key": key,
+            "value": _rounded(table, used, cut),
+            "cut": _cut(table, used, key, cut),
+        }
         yield _fault(table, "readings.burst", np.array([first, last - 1]), "fail", **facts)
         return
     if jump.noisy:

@@ -227,9 +227,7 @@ class Misfit:
             return xp.broadcast_to(x, (*(1,) * (scatter.ndim - 1), n))
 
         variance = _variance(wide(self.fixed_variance), wide(self.scale), scatter)
-        own = variance
-        if self.ordinate is not None:
-            own = _variance(wide(self.ordinate[0]), wide(self.ordinate[1]), scatter)
+        own = variance if self.ordinate is None else _variance(wide(self.ordinate[0]), wide(self.ordinate[1]), scatter)
         return ScaledMisfit(wide(self.raw), xp.sqrt(variance), self.design, 0.5 * xp.log(variance / own))
 
     def summary(self, xp: ModuleType = jnp) -> "Misfit | Moments":

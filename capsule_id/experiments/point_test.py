@@ -335,8 +335,17 @@ def check_branches(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
         if p < LEVEL:
             rising, falling = (float(np.polyfit(x[rows], y[rows], 1)[0]) for rows in (rise, fall))
             column, share = e.table.columns[e.reading], abs(size) / float(np.ptp(y))
-            facts = {"y": e.reading, "x": e.x_name, "unit": column.unit, "name": e.slope.name, "share": share, "p": p}
-            facts |= {"difference": size * column.to_display, "rising": rising, "falling": falling}
+            facts = {
+                "y": e.reading,
+                "x": e.x_name,
+                "unit": column.unit,
+                "name": e.slope.name,
+                "share": share,
+                "p": p,
+                "difference": size * column.to_display,
+                "rising": rising,
+                "falling": falling,
+            }
             findings.append(Finding("lines.branches", "warn", facts, e.label, (e.slope.name,)))
     return findings or [Finding("lines.branches", "ok", {"number": number})] * bool(number)
 
@@ -397,8 +406,16 @@ def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
             continue
         intercept, p, at_origin = origin_test(*readings, e.scale_known)
         if e.from_origin and at_origin is not None and p * len(lines) < LEVEL:
-            facts = {"name": e.slope.name, "slope": slope, "at_origin": at_origin, "slope_unit": e.slope.unit}
-            facts |= {"intercept": intercept, "unit": e.unit_of_y, "x": e.x_name, "p": p}
+            facts = {
+                "name": e.slope.name,
+                "slope": slope,
+                "at_origin": at_origin,
+                "slope_unit": e.slope.unit,
+                "intercept": intercept,
+                "unit": e.unit_of_y,
+                "x": e.x_name,
+                "p": p,
+            }
             findings.append(Finding("lines.origin", "warn", facts, e.label, (e.slope.name,)))
     return findings or [Finding("lines.straight", "ok", {"number": len(lines)})]
 

@@ -92,8 +92,7 @@ def hessian(terms: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector,
     estimates, beyond = [], np.zeros((len(rows), 1 + len(alone)), dtype=bool)
     for step in (STEP, RATIO * STEP):
         offsets = step * np.concatenate([pair, -pair, single, -single])
-        values = terms(np.concatenate([u + offsets, u[None]]))
-        parts = np.stack(np.split(values[:-1], 4))
+        parts = np.stack(np.split(terms(u + offsets), 4))
         # Beyond the domain the density is -inf; a NaN is a defect, and stays.
         beyond |= np.any(np.isneginf(parts), axis=0)
         plus, minus, cross, cross_minus = np.where(np.isneginf(parts), 0.0, parts)
@@ -113,12 +112,8 @@ def hessian(terms: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector,
 
 def jacobian(function: Callable[[np.ndarray], np.ndarray], u: Vector, step: Vector) -> Float[np.ndarray, "n d"]:
     """(n, d) Jacobian of ``function`` ((d,) -> (n,)) at u by central differences with ``step`` (d,)."""
-    columns = []
-    for j, h in enumerate(step):
-        offset = np.zeros_like(u)
-        offset[j] = h
-        columns.append((function(u + offset) - function(u - offset)) / (2.0 * h))
-    return np.stack(columns, axis=1)
+    sides = [(function(u + offset), function(u - offset)) for offset in np.diag(step)]
+    return np.stack([(ahead - behind) / (2.0 * h) for (ahead, behind), h in zip(sides, step, strict=True)], axis=1)
 
 
 def require_width(names: Sequence[str], u: Vector, covariance: Matrix) -> None:

@@ -154,7 +154,6 @@ class _Known(eqx.Module):
     jacobian: Any
 
     def __call__(self, v: jax.Array, args: None) -> tuple[jax.Array, None]:
-        del args
         value = jax.custom_jvp(lambda v: self.residuals + jnp.zeros_like(self.residuals, shape=()) * v[0])
         value.defjvp(lambda primals, tangents: (self.residuals, self.jacobian @ tangents[0]))
         return value(v), None

@@ -12,8 +12,7 @@ import emcee
 import h5py
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ndtri
-from scipy.stats import rankdata
+from scipy import special, stats
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.inference.curvature import Random
@@ -88,7 +87,7 @@ def pooled_time(draws: Draws) -> Float[np.ndarray, " d"]:
 def normal_scores(draws: Draws) -> Draws:
     """Normal scores of the ranks of every parameter over all ensembles (Vehtari et al. 2021, section 4.1)."""
     flat = draws.reshape(-1, draws.shape[-1])
-    return ndtri((rankdata(flat, axis=0) - 0.375) / (len(flat) + 0.25)).reshape(draws.shape)
+    return special.ndtri((stats.rankdata(flat, axis=0) - 0.375) / (len(flat) + 0.25)).reshape(draws.shape)
 
 
 def split_rhat(draws: Draws) -> Float[np.ndarray, " d"]:
@@ -426,17 +425,12 @@ class OpenBackend(emcee.backends.HDFBackend):
         self._file = file
 
     def open(self, mode: str = "r") -> AbstractContextManager[h5py.File]:
-        del mode
         return nullcontext(self._file)
 
     @property
     def initialized(self) -> bool:
         """Whether the file has draws of this ensemble; emcee asks for a file on disk."""
         return self.name in self._file
-
-    def last_state(self) -> emcee.State | None:
-        """State after the last stored draw; None if there is no draw."""
-        return self.get_last_sample() if self.initialized and self.iteration else None
 
 
 # chain store: Storage of chains that survives termination of the process at any moment.

@@ -316,9 +316,10 @@ def lines_of(e: Experiment, kind: Kind) -> str:
     """The entry of rig.toml that reads tests like ``e``: its settings and reading errors, in SI units."""
     columns, own = e.table.columns.values(), fields(e.table.settings)
     stated = {one.name: (one.default, getattr(e.table.settings, one.name)) for one in own}
-    shown = {"kind": json.dumps(kind.name), "file": json.dumps(f"{kind.name}_next.csv")}
-    shown |= {
-        key: _text(x, kind.setting_rules[key]) for key, (default, x) in stated.items() if x not in (default, None)
+    shown = {
+        "kind": json.dumps(kind.name),
+        "file": json.dumps(f"{kind.name}_next.csv"),
+        **{key: _text(x, kind.setting_rules[key]) for key, (default, x) in stated.items() if x not in (default, None)},
     }
     for column in columns:
         rule = QuantityRule("s" if column.name == "time" else kind.columns[column.name].si)

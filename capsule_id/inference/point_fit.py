@@ -8,8 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy import optimize
-from scipy.linalg import solve_triangular
+from scipy import linalg, optimize
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import Experiment
@@ -239,7 +238,7 @@ def root_of_covariance(target: LogPosterior, u: Vector, jacobian: Jacobian) -> t
                 count[target.names.index(row.name)] += 2.0 * experiment.n
     whitening = np.diag(np.maximum(count, 1e-2) ** -0.5)
     triangle = np.linalg.qr(np.nan_to_num(jacobian, posinf=0.0, neginf=0.0), mode="r")
-    whitening[np.ix_(located, located)] = solve_triangular(triangle, np.eye(len(located)))
+    whitening[np.ix_(located, located)] = linalg.solve_triangular(triangle, np.eye(len(located)))
     terms, zero, alone = terms_of(target), np.zeros(len(u)), np.flatnonzero(target.integrated)
     curvature = hessian(lambda w: terms(u + w @ whitening.T), zero, zero + 1.0, alone)
     # Reading errors may hide a scatter from any number of readings: its prior alone then gives its curvature.

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
-from scipy.optimize import minimize
+from scipy import optimize, stats
 
 from capsule_id.console import threads
 from capsule_id.errors import InputError
@@ -55,7 +54,7 @@ def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
         return penalty - likelihood
 
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        best = minimize(objective, start[free], method="BFGS", options={"gtol": 1e-6})
+        best = optimize.minimize(objective, start[free], method="BFGS", options={"gtol": 1e-6})
     u = start.copy()
     u[free] = best.x
     return -float(best.fun), target.mapping(target.theta(u))
@@ -344,9 +343,11 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
     target, findings = cut_unpredictable(target, known)
     # The joint fit takes one core most of the time: the bench is sampled on another one.
     with threads(1) as beside:
-        own = None
-        if alone and bench and sampled:
-            own = beside.submit(sample, MarginalPosterior(alone, bench), seed, BENCH_BUDGET)
+        own = (
+            beside.submit(sample, MarginalPosterior(alone, bench), seed, BENCH_BUDGET)
+            if alone and bench and sampled
+            else None
+        )
         target, joint, wavering = _fit_with_right_starts(target, known, seed)
         target, joint, second = fit_coloured(target, joint, seed)
         second += compare_laws(target, joint, seed)

@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from scipy import stats
-from scipy.linalg import null_space
+from scipy import linalg, stats
 
 from capsule_id.errors import InputError
 from capsule_id.inference.least_squares import linearised
@@ -62,7 +61,7 @@ def _profiles(target: LogPosterior, fit: PointFit, names: Sequence[str], values:
     for name in names:
         i = target.names.index(name)
         sd = float(np.linalg.norm(root[i]))
-        ridge, across = root @ root[i] / sd**2, root @ null_space(root[i : i + 1])
+        ridge, across = root @ root[i] / sd**2, root @ linalg.null_space(root[i : i + 1])
         across[i] = 0.0
         points = [(fit.u, float(np.max(fit.log_posterior)))]
         for side in (-1.0, 1.0):

@@ -217,12 +217,10 @@ class Mixture:
 def _given(covariance: Matrix, drawn: Bool[np.ndarray, " d"]) -> tuple[Matrix, Matrix]:
     """Slope of the other parameters on those ``drawn``, and root of the covariance that is left; unit root for those."""
     slope, root, rest = np.zeros_like(covariance), np.eye(len(covariance)), ~drawn
-    left = covariance[np.ix_(rest, rest)]
-    if drawn.any():
-        across = covariance[np.ix_(rest, drawn)]
-        own = np.linalg.solve(covariance[np.ix_(drawn, drawn)], across.T).T
-        slope[np.ix_(rest, drawn)], left = own, left - own @ across.T
-    root[np.ix_(rest, rest)] = np.linalg.cholesky(left)
+    across = covariance[np.ix_(rest, drawn)]
+    own = np.linalg.solve(covariance[np.ix_(drawn, drawn)], across.T).T
+    slope[np.ix_(rest, drawn)] = own
+    root[np.ix_(rest, rest)] = np.linalg.cholesky(covariance[np.ix_(rest, rest)] - own @ across.T)
     return slope, root
 
 

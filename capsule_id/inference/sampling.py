@@ -330,7 +330,10 @@ def sample(
                 if chains is not None:
                     chains.between_draws()
                 report(done, ENSEMBLES * goal, "sampling")
-            draws, lp = _completed(target, samplers, goal)
+            # Each proposal brings a draw of its scatters, which is accepted without regard to it.
+            located = np.stack([sampler.chain[:goal] for sampler in samplers])
+            factors = np.stack([sampler.parts[:goal] for sampler in samplers])
+            draws, lp = target.whole(located, factors.reshape(*factors.shape[:3], len(target.blocks), -1))
             if _converged(draws, ess):
                 break
         if chains is not None:
@@ -353,16 +356,6 @@ def sample(
         steps=draws.shape[1] * schedule.thin,
         thin=schedule.thin,
     )
-
-
-def _completed(target: MarginalPosterior, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first ``goal`` draws (ensemble, draw, walker, d) with scatters, and their log-posterior.
-
-    Each proposal brings a draw of its scatters, which is accepted without regard to it.
-    """
-    located = np.stack([sampler.chain[:goal] for sampler in samplers])
-    factors = np.stack([sampler.parts[:goal] for sampler in samplers])
-    return target.whole(located, factors.reshape(*factors.shape[:3], len(target.blocks), -1))
 
 
 def _converged(draws: np.ndarray, ess: float) -> bool:
@@ -463,9 +456,8 @@ def _sampler(target: MarginalPosterior, schedule: Schedule, seed: int, backend: 
 
     The starts are draws of the adapted proposal, or of the emulated posterior.
     """
-    last = None if backend is None else backend.last_state()
-    if last is not None:
-        return Ensemble(target.factors, last, schedule.moves, backend)
+    if backend is not None and backend.initialized and backend.iteration:
+        return Ensemble(target.factors, backend.get_last_sample(), schedule.moves, backend)
     start = _initial(target, schedule.start, np.random.RandomState(seed))
     steps = int(np.ceil(BURN_IN_IN_TAU * schedule.tau))
     burnt_in = Ensemble(target.factors, start, schedule.moves).run(steps, store=False).state

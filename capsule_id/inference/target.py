@@ -9,8 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
-from scipy.sparse.csgraph import connected_components
+from scipy import sparse, stats
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, Start, Unavailable, ValuesBySymbol
@@ -62,10 +61,10 @@ class Priors(eqx.Module):
             # The log-normal is a normal density of u; the others are normal densities of theta.
             centre = np.where(lognormal, np.log(location), location)
             width = np.where(lognormal, np.log(spread) / QUANTILE_975, spread)
-        mass = np.where(kinds == "positive_normal", location / spread, 0.0)
-        constant = np.where(kinds == "halfnormal", np.log(2.0), 0.0)
+        # Of a half-normal, whose location is 0, the restriction to positive values keeps a half.
+        positive = np.isin(kinds, ["positive_normal", "halfnormal"])
         self.lognormal, self.centre, self.width = jnp.asarray(lognormal), jnp.asarray(centre), jnp.asarray(width)
-        self.constant = jnp.asarray(constant - np.where(kinds == "positive_normal", stats.norm.logcdf(mass), 0.0))
+        self.constant = jnp.asarray(np.where(positive, -stats.norm.logcdf(location / spread), 0.0))
         self.jacobian = jnp.asarray(np.array([row.positive for row in parameters]) & ~lognormal)
 
     def at(self, index: Any, xp: ModuleType = jnp) -> "Priors":
@@ -406,7 +405,7 @@ class LogPosterior(eqx.Module):
             own = {row.name for row in experiment.parameters} | set(experiment.masses)
             member = np.array([name in own for name in self.names])
             adjacent |= np.outer(member, member)
-        count, label = connected_components(adjacent, directed=False)
+        count, label = sparse.csgraph.connected_components(adjacent, directed=False)
         return [np.flatnonzero(label == i) for i in range(count)]
 
     def constrain(self, u: Any, xp: ModuleType = jnp) -> Any:

@@ -315,8 +315,11 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
                     own |= {
                         AMPLITUDE[drive]: _value(chosen, AMPLITUDE[drive], table, getattr(settings, AMPLITUDE[drive]))
                     }
-                words = [f"{1e3 * period:g} ms", f"duty {duty:g}" if drive == "pulses" else ""]
-                words += [{"column": f"{size:g} N", "current": f"{size:g} A"}.get(source, "")]
+                words = [
+                    f"{1e3 * period:g} ms",
+                    f"duty {duty:g}" if drive == "pulses" else "",
+                    {"column": f"{size:g} N", "current": f"{size:g} A"}.get(source, ""),
+                ]
                 same = np.all(rows[:, (0, 2, 3)] == (period, duty, size), axis=1)
                 label = f"{table.label}: {', '.join(word for word in words if word)}"
                 found.append((label, own, float(np.mean(speed[same]))))

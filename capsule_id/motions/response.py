@@ -282,13 +282,15 @@ class Settling:
     max_steps: int = MAX_STEPS
 
     def __post_init__(self) -> None:
-        for name in ("dropped", "exponent_periods", "merge_contacts"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"{name} must not be negative", str(getattr(self, name)), "give 0 or more")
-        if self.observed < REPEATS:
-            raise InputError(f"observed must be at least {REPEATS}", str(self.observed), "observe more periods")
-        if self.max_steps < 1:
-            raise InputError("max_steps must be positive", str(self.max_steps), "give 1 or more")
+        for name, least, rule, remedy in (
+            ("dropped", 0, "not be negative", "give 0 or more"),
+            ("exponent_periods", 0, "not be negative", "give 0 or more"),
+            ("merge_contacts", 0, "not be negative", "give 0 or more"),
+            ("observed", REPEATS, f"be at least {REPEATS}", "observe more periods"),
+            ("max_steps", 1, "be positive", "give 1 or more"),
+        ):
+            if not getattr(self, name) >= least:
+                raise InputError(f"{name} must {rule}", str(getattr(self, name)), remedy)
 
 
 SETTLING = Settling()

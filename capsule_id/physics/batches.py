@@ -95,8 +95,10 @@ def lanes_of(tree: Tree, times: ArrayLike) -> tuple[Tree, Times, bool]:
     if any(rank not in (0, 1) for rank in ranks):
         shape = next(leaf.shape for leaf, rank in zip(leaves, ranks, strict=True) if rank not in (0, 1))
         raise InputError("a leaf must have shape () or (batch,)", str(shape), "use one batch axis, or jax.vmap")
-    sizes = {leaf.shape[0] for leaf, rank in zip(leaves, ranks, strict=True) if rank == 1}
-    sizes |= {grid.shape[0]} if grid.ndim == 2 else set()
+    sizes = {
+        *(leaf.shape[0] for leaf, rank in zip(leaves, ranks, strict=True) if rank == 1),
+        *(grid.shape[:1] if grid.ndim == 2 else ()),
+    }
     if len(sizes) > 1:
         raise InputError("all batch axes must have one length", f"lengths {sorted(sizes)}", "make them agree")
     lanes = sizes.pop() if sizes else 1

@@ -57,7 +57,8 @@ class Drive(Protocol):
     prescribed: ClassVar[bool] = False
 
     @property
-    def reaction(self) -> Any: ...
+    def reaction(self) -> Any:
+        """Share of the force that pushes the capsule back, 1; None: 0."""
 
     def force_at(self, t: Any, piece: Any = None) -> Any:
         """Force in N at the times t, s; leaves and t broadcast; NumPy and JAX.

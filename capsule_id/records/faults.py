@@ -463,8 +463,12 @@ def dropouts(values: np.ndarray) -> np.ndarray:
     earlier = np.abs(values[np.maximum(starts - 2, 0)] - before)
     later = np.abs(values[np.minimum(ends + 1, len(values) - 1)] - after)
     change = np.maximum(DROPOUT_CHANGES * np.minimum(earlier, later), DROPOUT_STEPS * reading_step(values))
-    far = (jump > DROPOUT_RANGE * spread) & (np.abs(after - before) < 0.5 * jump) & (jump > change)
-    far &= np.sign(own - before) == np.sign(own - after)
+    far = (
+        (jump > DROPOUT_RANGE * spread)
+        & (np.abs(after - before) < 0.5 * jump)
+        & (jump > change)
+        & (np.sign(own - before) == np.sign(own - after))
+    )
     starts, ends, own = starts[far], ends[far], own[far]
     # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
     levels, counts = np.unique(own, return_counts=True)

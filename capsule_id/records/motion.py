@@ -478,8 +478,10 @@ def _label(
         return UNDECIDED, repeat.probability, (repeat.reason,)
     period = period_word(repeat.period)
     missing = {"x_capsule was not recorded": velocity, "spring and gap are not stated": contacts}
-    reasons = [part.reason for part in missing.values() if part is not None and part.reason]
-    reasons += [words for words, part in missing.items() if part is None]
+    reasons = [
+        *(part.reason for part in missing.values() if part is not None and part.reason),
+        *(words for words, part in missing.items() if part is None),
+    ]
     if velocity is None or contacts is None or contacts.count is None or reasons or repeat.period == 0:
         return period, repeat.probability, tuple(reasons) if repeat.period else ()
     whole = f"{period}-{velocity.direction}-{Fraction(contacts.count, repeat.period)}"

@@ -63,10 +63,8 @@ def intervals_above(z: Record, low: float, high: float) -> list[tuple[int, int]]
     rises above ``high`` at all. The two levels keep noise about one level from splitting or joining stretches.
     """
     state = np.where(z > high, 1, np.where(z < low, 0, -1))
-    if not (state == 1).any():
-        return []
     if not (state == 0).any():
-        return [(0, len(z))]
+        return [(0, len(z))] * bool((state == 1).any())
     first = int(np.flatnonzero(state == 0)[0])
     turned = np.roll(state, -first)
     # Between the levels the last state stays.

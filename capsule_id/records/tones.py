@@ -28,8 +28,8 @@ def stated_Omega(table: Table) -> float:
         If no frequency is stated and the record is sampled unevenly.
     """
     settings = table.settings
-    unstated = settings.Omega is None and settings.f is None
-    return 2.0 * np.pi * dominant_frequency(table["time"], table["x_base"]) if unstated else settings.angular_frequency
+    f = settings.f if settings.Omega or settings.f else dominant_frequency(table["time"], table["x_base"])
+    return settings.Omega or 2.0 * np.pi * f
 
 
 def stated_gap(table: Table) -> Quantity:
@@ -211,9 +211,13 @@ def other_tone(time: Record, values: Record) -> float | None:
     """
     f, power, width = _spectrum(time, values)
     own = float(f[np.argmax(np.where(f < width, 0.0, power))])
-    line = np.pad((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]), 1)
-    line &= (f > 3.0 * width) & (np.abs(f - own) > 6.0 * width) & (power > LEAST_POWER * np.max(power[f >= width]))
-    line &= np.abs(f / own - np.round(f / own)) * own > 0.5 * width
+    line = (
+        np.pad((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]), 1)
+        & (f > 3.0 * width)
+        & (np.abs(f - own) > 6.0 * width)
+        & (power > LEAST_POWER * np.max(power[f >= width]))
+        & (np.abs(f / own - np.round(f / own)) * own > 0.5 * width)
+    )
     for i in sorted(np.flatnonzero(line), key=lambda i: -power[i]):
         off, wide = np.abs(f - f[i]), (max(2.0 * width, 0.15 * f[i]), max(6.0 * width, 0.35 * f[i]))
         around = (np.max(power[(off >= near) & (off <= far)]) for near, far in ((2.0 * width, 6.0 * width), wide))

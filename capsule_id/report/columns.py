@@ -354,16 +354,20 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = No
     """
     width = shutil.get_terminal_size((WIDTH, 24)).columns if width is None else width
     columns, rows = printed_table(summary, "console")
-    table = [["", *(column.header for column in columns)]]
-    table += [[name, *("NO" if cell == "no" else cell for cell in cells)] for name, cells in rows]
+    table = [
+        ["", *(column.header for column in columns)],
+        *([name, *("NO" if cell == "no" else cell for cell in cells)] for name, cells in rows),
+    ]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     shown = len(widths)
     while shown > 1 + KEPT and sum(widths[:shown]) + len(_GAP) * (shown - 1) > width:
         shown -= 1
     lines = _aligned([cells[:shown] for cells in table])
     skewed, left_out = skewed_names(summary), table[0][shown:]
-    notes = [f"{', '.join(skewed)}: skewed; quote the value with its 95 % interval"] if skewed else []
-    notes += [f"in a wider terminal and in report.html: {', '.join(left_out)}"] if left_out else []
+    notes = [
+        *([f"{', '.join(skewed)}: skewed; quote the value with its 95 % interval"] if skewed else []),
+        *([f"in a wider terminal and in report.html: {', '.join(left_out)}"] if left_out else []),
+    ]
     return "\n".join([*([SYNTHETIC] if synthetic else []), *lines, *wrapped(notes, width)])
 
 

@@ -166,11 +166,10 @@ def worst_tables(result: Result) -> dict[str, set[str]]:
         label, own = _group(result, item.label), largest_of[item.kind]
         largest = 0.0 if item.residuals is None else float(np.max(np.abs(item.residuals), initial=0.0))
         own[label] = max(own.get(label, 0.0), largest)
-
-    def worst(own: Mapping[str, float]) -> set[str]:
-        return {*sorted(own, key=lambda label: (found.get(label, len(_WORST_FIRST)), -own[label]))[:MOST_TABLES]}
-
-    return {kind: worst(own) for kind, own in largest_of.items()}
+    return {
+        kind: {*sorted(own, key=lambda label: (found.get(label, len(_WORST_FIRST)), -own[label]))[:MOST_TABLES]}
+        for kind, own in largest_of.items()
+    }
 
 
 def _group(result: Result, label: str) -> str:
@@ -236,16 +235,16 @@ def _corner_alt(columns: SampledParameters) -> str:
 
 def comparison_caption(item: Comparison, captions: Mapping[str, str]) -> str:
     """What the panel shows, and its posterior predictive p-value where there is one."""
-    parts = [captions.get(item.kind, "Measured beside predicted.")]
-    if figures.period_of(item):
-        parts.append("Above: the range in each period, and the periods with the largest residuals.")
-    if item.residuals is not None:
-        parts.append("Shaded: the range that holds 95 % of a good fit's residuals.")
-    if any(points.flagged is not None and points.flagged.any() for points in item.points):
-        parts.append("Framed rows are flagged by a check; they stay in the fit.")
-    if item.predictive_p is not None:
-        parts.append(f"Posterior predictive p = {item.predictive_p:.2g} (chi-square discrepancy).")
-    return " ".join(parts)
+    flagged = any(points.flagged is not None and points.flagged.any() for points in item.points)
+    p = item.predictive_p
+    parts = (
+        (True, captions.get(item.kind, "Measured beside predicted.")),
+        (figures.period_of(item), "Above: the range in each period, and the periods with the largest residuals."),
+        (item.residuals is not None, "Shaded: the range that holds 95 % of a good fit's residuals."),
+        (flagged, "Framed rows are flagged by a check; they stay in the fit."),
+        (p is not None, f"Posterior predictive p = {p or 0.0:.2g} (chi-square discrepancy)."),
+    )
+    return " ".join(words for holds, words in parts if holds)
 
 
 def _unique(labels: Iterable[str]) -> list[str]:
@@ -363,11 +362,9 @@ def sections_of(result: Result, measured: Sequence[Picture], shown: Sequence[Sho
         others = tuple(sorted(drawn[1:], key=lambda picture: picture.wide))
         names = frozenset(labels.get(label, {label}))
         sections.append(Section(label, level, tuple(found), drawn[0] if drawn else None, others, names))
-
-    def place(section: Section) -> tuple[int, bool]:
-        return _WORST_FIRST.index(section.level), section.picture is not None and section.picture.wide
-
-    return sorted(sections, key=place)
+    return sorted(
+        sections, key=lambda one: (_WORST_FIRST.index(one.level), one.picture is not None and one.picture.wide)
+    )
 
 
 def leading_section(result: Result, sections: Sequence[Section]) -> tuple[Section | None, str]:
@@ -410,12 +407,11 @@ def _note(note: ResultTable, messages: Mapping[str, Message]) -> dict[str, objec
     if not isinstance(frame.index, pd.RangeIndex):
         frame = frame.rename_axis(frame.index.name or "").reset_index(allow_duplicates=True)
     header = [(str(name), pd.api.types.is_numeric_dtype(kind)) for name, kind in frame.dtypes.items()]
-    rows = frame.itertuples(index=False, name=None)
     return {
         "title": title_of(note.code, messages),
         "caption": caption_of(note, messages),
         "header": header,
-        "rows": rows,
+        "rows": frame.itertuples(index=False, name=None),
     }
 
 

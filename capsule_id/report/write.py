@@ -53,9 +53,12 @@ def result_files(result: Result) -> dict[str, bytes]:
         "parameters.json": text,
     }
     sample = b"" if result.posterior is None else netcdf_bytes(data_tree(result))
-    files = {f"figures/{picture.name}.png": picture.png for picture in drawn}
-    files |= {SAVED.as_posix(): saved_bytes(result, sample)} | ({SAMPLE: sample} if sample else {})
-    return files | {name: as_utf8(text) for name, text in texts.items()}
+    return {
+        **{f"figures/{picture.name}.png": picture.png for picture in drawn},
+        SAVED.as_posix(): saved_bytes(result, sample),
+        **({SAMPLE: sample} if sample else {}),
+        **{name: as_utf8(text) for name, text in texts.items()},
+    }
 
 
 def write_result(files: Mapping[str, bytes], directory: Path) -> None:
@@ -364,8 +367,11 @@ def data_tree(result: Result) -> xr.DataTree:
         units |= {str(name): str(unit) for name, unit in frame["unit"].items()}
     ensembles, draws, walkers, _ = posterior.draws.shape
     chains = ensembles * walkers
-    chain = {"chain": np.arange(chains), "draw": np.arange(draws)}
-    chain |= {"ensemble": ("chain", np.repeat(np.arange(ensembles), walkers))}
+    chain = {
+        "chain": np.arange(chains),
+        "draw": np.arange(draws),
+        "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),
+    }
     # Exact masses stand among the draws as constants, so that whoever computes with draws has them all in one place.
     columns = dict(zip(posterior.names, np.moveaxis(_by_chain(posterior.draws), -1, 0), strict=True))
     stated = held_leaves(result.rig)

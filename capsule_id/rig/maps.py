@@ -313,8 +313,10 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
         for key, value in (*wanted.items(), *([(layout.split_by, "")] if layout.split_by else []))
         for form in (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))
     ]
-    words = tuple(form for form, value in keys if isinstance(value, str))
-    words += tuple(source.header for source in sources.values() if source.unit == STAMP)
+    words = (
+        *(form for form, value in keys if isinstance(value, str)),
+        *(source.header for source in sources.values() if source.unit == STAMP),
+    )
     layout = replace(layout, columns=(*named, *(form for form, _ in keys)), words=words)
     return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(wanted))
 

@@ -100,7 +100,6 @@ def read_rig(
         priors = _read_priors(root, None if planned else tables, rows, faults)
     with collecting(faults):
         model = read_model(root)
-    plan = dict[str, dict[str, float]]()
     with collecting(faults):
         plan = read_plan(root, kinds)
     raise_all(faults)
@@ -584,8 +583,9 @@ def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str
                     f"read {sets} off the record, {_A_TRIAL}, and repeat the trial; plateaus reads steps of one record",
                 )
             remedy = remedy_for(name, kind.columns, "remove it", "rename it to {}")
-            remedy += f"; known: {' '.join(kind.columns)}"
-            raise error(name, f"unknown column in {kind.name}", shown(name), remedy)
+            raise error(
+                name, f"unknown column in {kind.name}", shown(name), f"{remedy}; known: {' '.join(kind.columns)}"
+            )
     stated = {name for name in names if name not in (*kind.channels, *kind.optional)}
     if stated not in [set(columns) for columns in kind.sets]:
         raise error(names[0], f"{kind.name} must have the columns {sets}", " and ".join(names), "add or remove columns")

@@ -83,7 +83,6 @@ class SettingRule(Protocol):
         InputError
             At the node, where its value breaks the rule.
         """
-        ...
 
 
 @dataclass(frozen=True)
@@ -544,20 +543,22 @@ def check_masses(
         At the kind of the experiment, or at ``free``; it names the missing mass.
     """
     needs = [
-        (root["experiment"][table.entry]["kind"], mass, f"{table.kind} needs {mass}", "")
-        for table in tables
-        for mass in kinds[table.kind].masses(table)
-    ]
-    needs += [
-        (
-            root["model"]["free"],
-            mass,
-            f"free {symbol} needs {mass}, because {table.label} gives friction without the weight",
-            f', or remove "{symbol}"',
-        )
-        for symbol in model.free
-        for table in tables
-        for mass in kinds[table.kind].masses_of_free.get(symbol, ())
+        *(
+            (root["experiment"][table.entry]["kind"], mass, f"{table.kind} needs {mass}", "")
+            for table in tables
+            for mass in kinds[table.kind].masses(table)
+        ),
+        *(
+            (
+                root["model"]["free"],
+                mass,
+                f"free {symbol} needs {mass}, because {table.label} gives friction without the weight",
+                f', or remove "{symbol}"',
+            )
+            for symbol in model.free
+            for table in tables
+            for mass in kinds[table.kind].masses_of_free.get(symbol, ())
+        ),
     ]
     for node, mass, rule, other in needs:
         if mass not in stated:

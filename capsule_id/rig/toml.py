@@ -256,8 +256,10 @@ def closest(word: str, known: Collection[str]) -> str | None:
     None where no word is similar, or where a part of a similar one is another word: ``k2_back`` does not mean ``mu_back``.
     """
     parts = re.split(r"[_\W]+", word[:_LONGEST_SHOWN].lower())
-    folded = {tuple(re.split(r"[_\W]+", one.lower())): one for one in reversed([*known])}
-    folded |= {tuple(alias.split("_")): one for alias, one in _ALIASES.items() if one in known and alias not in known}
+    folded = {
+        **{tuple(re.split(r"[_\W]+", one.lower())): one for one in reversed([*known])},
+        **{tuple(alias.split("_")): one for alias, one in _ALIASES.items() if one in known and alias not in known},
+    }
     joined = {"".join(each): one for each, one in folded.items()}
     same = [
         each

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, make_dataclass
 from functools import partial
 from pkgutil import resolve_name
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -222,9 +222,15 @@ def _columns(table: Table[Any]) -> Iterable[Finding]:
             strong = max(expected, abs(accelerates.value)) > STRONG * float(np.std(whole["acceleration_rod"]))
             ratio = derivative_ratio(moves, accelerates, frequency, 2)
             if strong and abs(moves.value) > SIGN_ERRORS * moves.sd and not low <= ratio.real <= high:
-                other = "x_rel + x_capsule" if "x_capsule" in whole else "x_rel"
-                facts = {"file": table.file, "position": other, "ratio": ratio.real, "low": low, "high": high}
-                yield Finding("runs.kinematics", "fail", {**facts, "harmonic": harmonic}, table.label)
+                facts = {
+                    "file": table.file,
+                    "position": "x_rel + x_capsule" if "x_capsule" in whole else "x_rel",
+                    "ratio": ratio.real,
+                    "low": low,
+                    "high": high,
+                    "harmonic": harmonic,
+                }
+                yield Finding("runs.kinematics", "fail", facts, table.label)
                 return
     if "current" in whole:
         power, error = drive_power(phasor(time, whole["current"], Omega), first, Omega)
@@ -336,11 +342,6 @@ class RunSettings(ChannelSettings):
     start: Literal["auto", "stuck", "moving", "settled"] = "auto"
     noise: Literal["white", "ar1"] | None = None
     segment: Annotated[float | None, QuantityRule("s")] = None
-
-    @property
-    def angular_frequency(self) -> float:
-        """Stated frequency of the drive, rad/s; the reader ensures that it is stated."""
-        return self.Omega or 2.0 * np.pi * cast(float, self.f)
 
 
 def _second_fit(facts: Facts) -> str:

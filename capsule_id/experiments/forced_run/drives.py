@@ -109,8 +109,12 @@ def feasibility(
     decay, period, wanted = DECAY_TIMES * 2.0 * m1 / c, 2.0 * np.pi / Omega, SETTLED_PERIODS
     periods = (float(time[-1] - time[0]) - decay) / period
     if not periods >= wanted:
-        facts = {"periods": max(periods, 0.0), "decay": decay, "wanted": wanted, "seconds": decay + wanted * period}
-        found["runs.length"] = facts
+        found["runs.length"] = {
+            "periods": max(periods, 0.0),
+            "decay": decay,
+            "wanted": wanted,
+            "seconds": decay + wanted * period,
+        }
     return [Finding(code, "warn", facts, table.label) for code, facts in found.items()]
 
 

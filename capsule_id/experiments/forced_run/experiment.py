@@ -226,8 +226,11 @@ class CapsuleRun(CapsuleForward):
         rows += [] if self.settled else [parameter("x_start", of, position)]
         rows += [] if self.settled or self.prescribed else [parameter("y_start", of, rate)]
         rows += [CAPSULE_START.named(of, rate)] if self.moves else []
-        rows += [NOISE[channel.name].named(whole, scatter_prior(channel.extent)) for channel in self.channels]
-        return [*rows, *(CORRELATION[name].named(whole) for name in self.names if self.coloured)]
+        return [
+            *rows,
+            *(NOISE[channel.name].named(whole, scatter_prior(channel.extent)) for channel in self.channels),
+            *(CORRELATION[name].named(whole) for name in self.names if self.coloured),
+        ]
 
     def unstated_errors(self, symbol: str) -> set[str]:
         """The offsets of all channels are free."""
@@ -285,8 +288,14 @@ class CapsuleRun(CapsuleForward):
 
     def remade(self, table: Table, **changed: Any) -> "CapsuleRun":
         """Return a run of ``table``, the record or a part of it, with other arguments of the constructor."""
-        own = {"friction": self.friction, "part_of": self.about.record, "leads": self.about.leads}
-        own |= {"capsule_rate": self.rough.capsule_rate, "coloured": self.coloured, **changed}
+        own = {
+            "friction": self.friction,
+            "part_of": self.about.record,
+            "leads": self.about.leads,
+            "capsule_rate": self.rough.capsule_rate,
+            "coloured": self.coloured,
+            **changed,
+        }
         return type(self)(table, self.rig, **own).with_smoothing(self.smoothing)
 
     # -- what the record is -----------------------------------------------------------------------------------------

@@ -4,9 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
-from scipy.ndimage import uniform_filter1d
-from scipy.optimize import nnls
+from scipy import integrate, ndimage, optimize
 
 from capsule_id.experiments.base import About
 from capsule_id.records.tones import SIGNIFICANT, noise_level, tone_at
@@ -41,7 +39,7 @@ def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: f
     m2 : mass of the capsule, kg
     """
     samples = max(3, round(SMOOTHED * period * len(time) / (time[-1] - time[0])))
-    rate = uniform_filter1d(np.gradient(X2, time), samples)
+    rate = ndimage.uniform_filter1d(np.gradient(X2, time), samples)
     direction = np.where(np.abs(rate) > SLIDING * np.max(np.abs(rate)), np.sign(rate), 0.0)
     edges = np.flatnonzero(np.diff(direction)) + 1
     pieces = np.split(np.arange(len(time)), edges.tolist())
@@ -55,7 +53,7 @@ def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: f
         return None
     # The constant part of the extension has either sign.
     design = rows[:, [0, 1, 2, 2, 3]] * np.array([1.0, 1.0, 1.0, -1.0, 1.0]) / size[[0, 1, 2, 2, 3]]
-    found = nnls(design, rows[:, 4])[0] / size[[0, 1, 2, 2, 3]]
+    found = optimize.nnls(design, rows[:, 4])[0] / size[[0, 1, 2, 2, 3]]
     k1, c, force, friction = float(found[0]), float(found[1]), float(found[2] - found[3]), float(found[4])
     if not (k1 > 0.0 and friction > 0.0):
         return None
@@ -67,8 +65,8 @@ def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: f
 def _slide(time: np.ndarray, r: np.ndarray, momentum: np.ndarray, direction: float) -> np.ndarray:
     """(n, 5) coefficients of k1, c, k1 x0 and F, and ``momentum`` = m2 X2, of one slide, without its line in time."""
     t = time - time[0]
-    once = cumulative_trapezoid(r, t, initial=0.0)
-    twice = cumulative_trapezoid(once, t, initial=0.0)
+    once = integrate.cumulative_trapezoid(r, t, initial=0.0)
+    twice = integrate.cumulative_trapezoid(once, t, initial=0.0)
     rows = np.stack([twice, once - r[0] * t, 0.5 * t**2, -0.5 * direction * t**2, momentum], axis=1)
     line = np.linalg.qr(np.stack([np.ones_like(t), t], axis=1))[0]
     return rows - line @ (line.T @ rows)

@@ -254,11 +254,6 @@ def _make(table: Table[DecaySettings], rig: Rig, friction: Any) -> tuple[Any, ..
     return tuple(e for part in parts for e in make(part, rig, friction))
 
 
-def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
-    """Symbols of the required masses: the rod, and the capsule where it may move."""
-    return ("m1", "m2") if table.settings.capsule == "free" or table.settings.forward == "capsule" else ("m1",)
-
-
 def _paper(experiments: Sequence[Any]) -> Values:
     """Estimate k1 = m1 Omega_o^2 and c by logarithmic decrement after Savitzky–Golay, as in the paper; record means."""
     found = [d for d in (e.paper_decrement() for e in experiments) if d is not None]
@@ -334,7 +329,10 @@ KIND = Kind(
         Entry.check_springs_with_gaps,
         _check_settings,
     ),
-    masses=_masses,
+    # The rod, and the capsule where it may move.
+    masses=lambda table: (
+        ("m1", "m2") if table.settings.capsule == "free" or table.settings.forward == "capsule" else ("m1",)
+    ),
     parameters=(
         *(channel.noise for channel in CHANNELS.values()),
         TIME_SD,

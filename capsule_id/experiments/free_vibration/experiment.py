@@ -138,8 +138,15 @@ def halves(changes: Changes) -> Check:
             return None
         name = max(found, key=lambda name: abs(found[name][2]))
         first, second, z, matters = found[name]
-        facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
-        return {**facts, "model": e.model_name, "stated": e.stated_words}, graded(abs(z), matters)
+        return {
+            "name": name,
+            "first": first,
+            "second": second,
+            "z": abs(z),
+            "unit": parameter(name).unit,
+            "model": e.model_name,
+            "stated": e.stated_words,
+        }, graded(abs(z), matters)
 
     return each("decays.halves", judge)
 

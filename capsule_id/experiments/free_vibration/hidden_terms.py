@@ -6,9 +6,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy import special, stats
-from scipy.optimize import least_squares
-from scipy.signal import lsim
+from scipy import optimize, signal, special, stats
 
 from capsule_id.experiments.base import LEVEL, Fitted, ValuesBySymbol, refit, stretch
 from capsule_id.experiments.free_vibration.decrement import PEAKLESS, STRONGEST, UNKNOWNS, viscous_fit, viscous_state
@@ -90,7 +88,7 @@ def force_responses(e: DecayRecord, theta: Mapping[str, float]) -> dict[str, np.
     system = ([1.0 / m1], [1.0, c / m1, k1 / m1])
     found = {}
     for name, force in zip(FURTHER, (np.sign(rate), rate * np.abs(rate), x**3), strict=True):
-        response = -lsim(system, force, grid)[1]
+        response = -signal.lsim(system, force, grid)[1]
         for _ in range(e.order):
             response = np.gradient(response, grid[1])
         found[name] = np.interp(time, grid, response)
@@ -258,8 +256,15 @@ def _change(name: str, value: float, terms: Mapping[str, Hidden], swings: bool) 
             largest.append(max(np.abs(term.limits(symbol == "k_cubic"))))
     if not symbols:
         return {}
-    facts = {"name": name, "unit": parameter(name).unit, "value": value, "low": max(0.0, min(ends)), "high": max(ends)}
-    return {**facts, "symbols": symbols, "largest": largest}
+    return {
+        "name": name,
+        "unit": parameter(name).unit,
+        "value": value,
+        "low": max(0.0, min(ends)),
+        "high": max(ends),
+        "symbols": symbols,
+        "largest": largest,
+    }
 
 
 def hidden_terms(records: Sequence[Decay], values: Mapping[str, float]) -> dict[str, Hidden]:
@@ -403,7 +408,7 @@ def changing(members: Sequence[DecayRecord], values: Mapping[str, float], symbol
         return np.concatenate([left_by(e, {**theta, **moved}, {symbol: z[2]}) / sd for e, theta, sd in parts])
 
     widest = np.array(WIDEST_CHANGE)
-    found = least_squares(left, np.zeros(3), bounds=(-widest, widest), x_scale="jac")
+    found = optimize.least_squares(left, np.zeros(3), bounds=(-widest, widest), x_scale="jac")
     ends = np.cumsum([e.n for e in members])
     parts = zip(np.split(found.fun, ends[:-1]), least / noise, strict=True)
     gain = -sum(len(part) * np.log(max(np.mean(part**2), share**2)) for part, share in parts)
@@ -448,8 +453,6 @@ def check_held(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
         table.label for e in records for table in e.rig.tables if getattr(table.settings, "start", None) is not None
     }
     judged = [e for e in records if e.table.label not in stated]
-    if not judged:
-        return []
     allowed = [_releases(e, e.local(fit.values)) for e in judged]
     matters = any(map(len, allowed))
     alone = [refit(e, e.local(fit.values), []) for e in judged] if matters else []
@@ -465,16 +468,18 @@ def check_held(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
             changes = weight * (others[:, k, None] + QUANTILE_975 * others[:, 2 + k, None] * [[-1.0, 1.0]] - value)
             low, high = np.min(changes, initial=0.0), np.max(changes, initial=0.0)
             if max(high, -low) > (1.0 + QUANTILE_975) * error:
-                facts = {"name": name, "unit": parameter(name).unit, "value": value, "label": e.label}
-                facts |= {
+                facts = {
+                    "name": name,
+                    "unit": parameter(name).unit,
+                    "value": value,
+                    "label": e.label,
                     "low": max(value + low, 0.0),
                     "high": value + high,
                     "start": float(decay_window(e.table)[0][0]),
                 }
                 level: Level = "warn" if value + low > 0.0 else "fail"
                 findings.append(Finding("decays.held", level, facts, e.label, (name,) if level == "fail" else ()))
-    labels = listed(e.label for e in judged)
-    return findings or [Finding("decays.held", "ok", {"labels": labels})]
+    return findings or [Finding("decays.held", "ok", {"labels": listed(e.label for e in judged)})] * bool(judged)
 
 
 def _releases(e: DecayRecord, theta: ValuesBySymbol) -> np.ndarray:
@@ -507,7 +512,7 @@ def _releases(e: DecayRecord, theta: ValuesBySymbol) -> np.ndarray:
     z, tried = np.log([free.omega, free.ratio]), []
     bounds = z - WIDEST, z + WIDEST
     for release in np.linspace(LATEST_RELEASE * period, 0.0, RELEASES + 1):
-        found = least_squares(left, z, args=(release,), bounds=bounds, x_scale=0.1, max_nfev=30)
+        found = optimize.least_squares(left, z, args=(release,), bounds=bounds, x_scale=0.1, max_nfev=30)
         z, k1, c = found.x, *(values(found.x)[name] for name in ("k1", "c"))
         inverse = np.linalg.pinv(found.jac.T @ found.jac)
         errors = [2.0 * k1 * np.sqrt(inverse[0, 0]), c * np.sqrt(np.sum(inverse))]

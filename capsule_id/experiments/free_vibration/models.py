@@ -201,18 +201,14 @@ def decay_moments(folded: Any, n: int, step: Any, gamma: Any, omega: Any) -> tup
     outer = jnp.exp(rate * baby * jnp.arange(giant))
     rows = folded @ jnp.stack([inner.real, inner.imag], axis=-1)
     projection = jnp.sum(outer * (rows[:, 0] + 1j * rows[:, 1]))
-    plain, squared, modulus = (_series(q, n) for q in (rate, 2.0 * rate, -2.0 * gamma * step))
+    # Sums of exp(q j) over j = 0 .. n-1.
+    plain, squared, modulus = (jnp.expm1(q * n) / jnp.expm1(q) for q in (rate, 2.0 * rate, -2.0 * gamma * step))
     cc, ss, cs = 0.5 * (modulus + squared.real), 0.5 * (modulus - squared.real), 0.5 * squared.imag
     aa = jnp.array([[cc, cs, plain.real], [cs, ss, plain.imag], [plain.real, plain.imag, n]])
     ay = jnp.array([projection.real, projection.imag, jnp.sum(folded)])
     struck = jnp.sqrt(gamma**2 + omega**2) / omega
     basis = jnp.array([[1.0, 0.0, 0.0], [gamma / omega, struck, 0.0], [0.0, 0.0, 1.0]])
     return jnp.sum(folded**2), ay @ basis, basis.T @ aa @ basis
-
-
-def _series(exponent: Any, n: int) -> Any:
-    """Sum of exp(exponent j) over j = 0 .. n-1."""
-    return jnp.expm1(exponent * n) / jnp.expm1(exponent)
 
 
 def uniform_step(time: np.ndarray) -> float | None:

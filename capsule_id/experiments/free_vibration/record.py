@@ -412,10 +412,12 @@ class DecayRecord(Decay):
         }
         rows += [shapes[symbol] for symbol in self.model.shapes]
         if not self.closed:
-            rows += further_parameters(self.model.symbols, self.rough.k1, self.mass, self.largest_deflection)
             size = self.deflection * float(np.ptp(self.values))
-            rows.append(AMPLITUDE.named(label, Prior("lognormal", size, NUISANCE_WIDTH)))
-            rows.append(TURNING_TIME.named(label, Prior("normal", 0.0, float(self.time[-1]))))
+            rows += [
+                *further_parameters(self.model.symbols, self.rough.k1, self.mass, self.largest_deflection),
+                AMPLITUDE.named(label, Prior("lognormal", size, NUISANCE_WIDTH)),
+                TURNING_TIME.named(label, Prior("normal", 0.0, float(self.time[-1]))),
+            ]
         return rows
 
     @property
@@ -460,9 +462,8 @@ class DecayRecord(Decay):
         return self.n * (4 if self.model.whitened else 1) + 12 * steps
 
     def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
-        trend = xp.ones((self.n, 1))
-        if self.model.drift == "linear":
-            trend = xp.stack([xp.ones(self.n), xp.asarray(self.time) / self.time[-1] - 0.5], axis=1)
+        slope = [xp.asarray(self.time) / self.time[-1] - 0.5] if self.model.drift == "linear" else []
+        trend = xp.stack([xp.ones(self.n), *slope], axis=1)
         if self.model.hum:
             tone = hum_columns(xp.asarray(self.nodes).ravel(), self.model.hum, xp)
             trend = xp.concatenate([trend, block_mean(tone, self.weights, xp)], axis=1)
@@ -478,11 +479,12 @@ class DecayRecord(Decay):
 
     def whitened(self, theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
         table = np.reshape(columns, (self.n, -1))
-        if self.model.whitened:
-            table = np.asarray(whiten(self.times, table, self.model, theta))
-        else:
-            table = table / np.reshape(self.relative_sd, (-1, 1))
-        return np.reshape(table, columns.shape)
+        white = (
+            np.asarray(whiten(self.times, table, self.model, theta))
+            if self.model.whitened
+            else table / np.reshape(self.relative_sd, (-1, 1))
+        )
+        return np.reshape(white, columns.shape)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         raw, design = self.unwhitened(theta, xp)

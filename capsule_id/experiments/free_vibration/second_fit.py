@@ -291,10 +291,8 @@ def _demanded(records: list[DecayRecord], level: float) -> Demanded:
     own = [e.with_model(e.model, table=first_periods(e.table)) for e in records]
     humming = [e for e in own if e.model.hum]
     # Where hum is the cause, no further force is needed.
-    if humming and not any(demands_another(e, level) for e in own if e.n >= SHORTEST):
-        ranking = rank([*map(Screening, own)], [humming[0].model])[0]
-    else:
-        ranking = demanded_model(own)
+    hum_alone = humming and not any(demands_another(e, level) for e in own if e.n >= SHORTEST)
+    ranking = rank([*map(Screening, own)], [humming[0].model])[0] if hum_alone else demanded_model(own)
     text = _drift_text(own, ranking)
     if ranking.model.slow and any(part.n < whole.n for part, whole in zip(own, records, strict=True)):
         text += f" The second fit uses the first {MOST_PERIODS} periods of each record."

@@ -278,7 +278,6 @@ class TurningPoints(Decay):
     index: np.ndarray
     sides: np.ndarray
     width: float
-    time_width: float
     time_reading_sd: float
     steps: tuple[float, ...] = eqx.field(static=True)
     last: int = eqx.field(static=True)
@@ -307,7 +306,6 @@ class TurningPoints(Decay):
         first = np.sign(self.values[0] - self.values[1]) if self.both_sides else np.sign(self.values[0])
         self.sides = first * np.where(index % 2 == 0, 1.0, -1.0)
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
-        self.time_width = NUISANCE_WIDTH * float(self.time[-1])
         columns = [table.columns[name] for name in ("x_rel", "time")]
         self.steps = tuple(column.unstated_step for column in columns)
         errors = [
@@ -317,15 +315,16 @@ class TurningPoints(Decay):
         self.clock_rate = stated_rate(table)
         self.about = DecayAbout(table, rig, ())
         rough = self.paper_decrement()
-        rows = [parameter("k1"), parameter("c")]
-        rows += further_parameters(self.model.symbols, rough.k1, self.mass, float(np.max(np.abs(rough.peaks))))
-        rows += [
+        rows = (
+            parameter("k1"),
+            parameter("c"),
+            *further_parameters(self.model.symbols, rough.k1, self.mass, float(np.max(np.abs(rough.peaks)))),
             AMPLITUDE.named(table.label, Prior("lognormal", abs(float(rough.peaks[0])), NUISANCE_WIDTH)),
             NOISE_SD.named(table.label, scatter_prior(float(np.ptp(self.values)))),
             TIME_SD.named(table.label, scatter_prior(float(np.median(step)))),
             *clock_parameters(table, rig),
-        ]
-        self.about = DecayAbout(table, rig, tuple(rows), screened, rough)
+        )
+        self.about = DecayAbout(table, rig, rows, screened, rough)
 
     def unstated_errors(self, symbol: str) -> set[str]:
         """Those of one side are amplitudes, counted from a zero that the readings do not show."""
@@ -366,7 +365,7 @@ class TurningPoints(Decay):
         rest = self.width * one[:, : int(self.both_sides)]
         return (
             Misfit(positions, self.reading_sd**2, 1.0, rest),
-            Misfit(times, self.time_reading_sd**2, 1.0, self.time_width * one),
+            Misfit(times, self.time_reading_sd**2, 1.0, NUISANCE_WIDTH * self.time[-1] * one),
         )
 
     def paper_decrement(self) -> Decrement:

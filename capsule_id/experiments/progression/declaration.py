@@ -269,8 +269,9 @@ def settings_of(columns: Mapping[str, Column], settings: ProgressionSettings) ->
 
 def sessions_of(table: Table, rows: np.ndarray) -> np.ndarray:
     """(n, sessions) membership: by the column, else blocks of consecutive rows with equal settings."""
-    if "session" in table.columns:
-        index = np.unique(table["session"], return_inverse=True)[1]
-    else:
-        index = np.cumsum(np.concatenate([[0], np.any(rows[1:] != rows[:-1], axis=1)]))
+    index = (
+        np.unique(table["session"], return_inverse=True)[1]
+        if "session" in table.columns
+        else np.cumsum(np.concatenate([[0], np.any(rows[1:] != rows[:-1], axis=1)]))
+    )
     return np.eye(int(np.max(index)) + 1)[index]

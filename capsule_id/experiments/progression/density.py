@@ -260,8 +260,10 @@ class RunEmulator(eqx.Module):
     ) -> None:
         """Fit to the ``motions`` at ``draws``; ``positive``: parameters of the motion, and whether each is positive."""
         self.symbols = sessions.symbols
-        groups = [({**positive, "session_sd": True}, np.all(sessions.own == 0.0, axis=1))]
-        groups += [({**positive, name: False}, sessions.own[:, j] > 0.0) for j, name in enumerate(self.symbols)]
+        groups = [
+            ({**positive, "session_sd": True}, np.all(sessions.own == 0.0, axis=1)),
+            *(({**positive, name: False}, sessions.own[:, j] > 0.0) for j, name in enumerate(self.symbols)),
+        ]
         groups = [(inputs, np.flatnonzero(own)) for inputs, own in groups if np.any(own)]
         known = [self._inputs(draw) for draw in draws]
         self.parts = tuple(pool().map(lambda group: Emulator(group[0], known, motions[:, group[1]]), groups))

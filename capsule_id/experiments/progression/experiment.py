@@ -198,17 +198,19 @@ class Progression(CapsuleForward):
 
     def _sampled(self) -> tuple[Parameter, ...]:
         settings, free = self.table.settings, self.rig.model.free
-        rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
-        rows += [parameter("k_cubic")] if "k_cubic" in free else []
         name = AMPLITUDE[self.drive]
-        rows += [parameter("K")] if self.amplitude_from == "current" else []
-        rows += stated_parameters(name, getattr(settings, name), kind="normal")
-        rows += lag_parameters(self.table, self.rig)
         largest = float(np.max(np.abs(self.distance)))
         speed = float(np.max(np.abs(self.distance / (self.setting @ self.time))))
         floor = np.sqrt(self.reading_variance) + 1e-9
         return (
-            *rows,
+            parameter("k1"),
+            parameter("c"),
+            *self.friction.parameters,
+            *ground_parameters(self.table, self.rig),
+            *([parameter("k_cubic")] if "k_cubic" in free else []),
+            *([parameter("K")] if self.amplitude_from == "current" else []),
+            *stated_parameters(name, getattr(settings, name), kind="normal"),
+            *lag_parameters(self.table, self.rig),
             SESSION_SD,
             *(row.named(self.label) for row in SESSIONS[: len(self.sessions.symbols)]),
             TRIAL_SCATTER,

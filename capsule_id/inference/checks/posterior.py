@@ -6,10 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy import stats
-from scipy.fft import dct
-from scipy.ndimage import gaussian_filter1d
-from scipy.special import ndtri_exp
+from scipy import fft, ndimage, special, stats
 
 from capsule_id.experiments.base import LEVEL, Experiment
 from capsule_id.experiments.lint import wrong_prefix
@@ -99,7 +96,7 @@ def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
     scale = outer / stats.t.isf(TAIL, freedom)
     tail = stats.t.logsf(abs(value - centre) / scale, freedom)
     # z with the same log(1 - Phi(z)), also where the tail itself underflows.
-    return float(np.copysign(ndtri_exp(tail), laplace))
+    return float(np.copysign(special.ndtri_exp(tail), laplace))
 
 
 def check_agreement(s: SampledFit) -> list[Finding]:
@@ -220,7 +217,7 @@ def modes(u: np.ndarray, size: float) -> list[tuple[float, float]]:
     spread = min(float(np.std(u)), float(np.subtract(*np.quantile(u, [0.75, 0.25]))) / 1.34)
     # The size is NaN where a walker never moved; the bandwidth is then that of few draws.
     bandwidth = 0.9 * spread * max(10.0, size) ** -0.2 / (edges[1] - edges[0])
-    density = gaussian_filter1d(count.astype(float), max(bandwidth, 1.0), mode="constant")
+    density = ndimage.gaussian_filter1d(count.astype(float), max(bandwidth, 1.0), mode="constant")
     # Each mode is a range of bins; ranges merge until every valley is deep and every mode has weight.
     inner = np.flatnonzero((density[1:-1] <= density[:-2]) & (density[1:-1] < density[2:])) + 1
     cuts = [0, *inner.tolist(), BINS]
@@ -258,8 +255,11 @@ def check_starts(fit: PointFit, target: LogPosterior | None = None, sample: Post
     away = np.where(np.isfinite(distance), distance, np.inf).max(axis=1)
     worst = int(np.argmax(np.where(fit.at_other_maximum, away, -np.inf)))
     below = np.max(fit.log_posterior) - np.where(np.isfinite(fit.log_posterior), fit.log_posterior, -np.inf)
-    facts |= {"distance": away[worst], "name": fit.names[int(np.argmax(distance[worst]))]}
-    facts |= {"below": float(np.min(below[fit.at_other_maximum]))}
+    facts |= {
+        "distance": away[worst],
+        "name": fit.names[int(np.argmax(distance[worst]))],
+        "below": float(np.min(below[fit.at_other_maximum])),
+    }
     if target is not None and sample is not None and sample.converged:
         u = target.unconstrain(sample.draws.reshape(-1, len(sample.names)))
         low, high = np.min(u, axis=0), np.max(u, axis=0)
@@ -308,8 +308,7 @@ def conflicts(s: SampledFit) -> dict[str, dict[str, float]]:
         alone, alone_sd = middle + (centre[i] - middle) / informed, sd[i] / np.sqrt(informed)
         value, scale = (np.exp(alone), np.exp(alone)) if prior.lognormal else (alone, 1.0)
         z = (centre[i] - middle) / (width * np.sqrt(informed))
-        if default_scatter(s, row):
-            z = max(z, 0.0)
+        z = max(z, 0.0) if default_scatter(s, row) else z
         found[row.name] = {"z": float(z), "value": float(value), "sd": float(scale * alone_sd), "informed": informed}
     return found
 
@@ -392,7 +391,7 @@ SLOWEST = 3
 STATISTICS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
     "sign runs": lambda r: -np.sum(np.signbit(r[:, 1:]) != np.signbit(r[:, :-1]), axis=1).astype(float),
     "largest": lambda r: np.max(np.abs(r), axis=1),
-    "trend": lambda r: np.sum(np.asarray(dct(r, axis=1, norm="ortho"))[:, 1 : 1 + SLOWEST] ** 2, axis=1),
+    "trend": lambda r: np.sum(np.asarray(fft.dct(r, axis=1, norm="ortho"))[:, 1 : 1 + SLOWEST] ** 2, axis=1),
 }
 
 
