@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import MISSING, dataclass, fields
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from capsule_id.console import OnProgress, Progress, fit_stages
 from capsule_id.errors import InputError
-from capsule_id.experiments.friction_model import friction_of
+from capsule_id.experiments.friction_model import CONSTANT, friction_of
 from capsule_id.experiments.kind import Choice, Registry, default_registry, make_experiments
 from capsule_id.inference.pipeline import (
     check_fit,
@@ -32,9 +33,9 @@ from capsule_id.inference.pipeline import (
 )
 from capsule_id.inference.planning import Plan, next_tests
 from capsule_id.inference.point_stage import fit_points
-from capsule_id.inference.prediction import DRAWS, predict, random_draws
+from capsule_id.inference.prediction import DRAWS, predict, random_draws, require_equation_1
 from capsule_id.inference.profiles import check_profiled
-from capsule_id.inference.result import Result
+from capsule_id.inference.result import Result, held_leaves
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
 from capsule_id.inference.tuning import Tuning, tune
@@ -250,9 +251,17 @@ class Fit(Result):
             If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter or the gap is missing.
         """
         chosen = random_draws(self, draws, np.random.default_rng(seed))
-        rig = {name: getattr(self.rig, name) for name in ("m1", "m2", "g", "slope", "N0")}
-        stated = {name: quantity.value for name, quantity in rig.items() if quantity is not None}
+        constant = self.rig.model.friction == "constant"
+        if not constant:
+            require_equation_1(self)
+        stated = {name: x for name, x in held_leaves(self.rig).items() if x is not None}
+        stated |= CONSTANT if constant else {}
         values = {**stated, **self.fixed, "k2": 0.0, "G": gap, **chosen, **(given or {})}
+        reaction, fitted = getattr(drive, "reaction", None), self.rig.model.share_of_reaction
+        if reaction is not None and np.any(np.asarray(reaction) != fitted):
+            warnings.warn(f"the drive has reaction = {reaction}; that of the fit is {fitted:g}", stacklevel=2)
+        if lost := [name for name in ("F_dry", "c_q") if name in chosen]:
+            warnings.warn(f"the capsule has no {' and no '.join(lost)}: its rod is damped by c alone", stacklevel=2)
         if spring is not None:
             springs = by_index("k2", chosen)
             if spring not in springs:

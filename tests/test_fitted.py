@@ -26,6 +26,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import BLOCKS
 from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.report.write import _digest, data_tree, netcdf_bytes, parameters_json
+from capsule_id.rig.model import ModelChoices, Quantity
 from capsule_id.synthetic import truth_beside
 from capsule_id.views import Finding, Level
 from tests.cli_tools import DATA, ROOT, listing, small_rig
@@ -222,6 +223,11 @@ def test_the_calibrated_model_as_json(capsule: Fit, tmp_path: Path) -> None:
     factors = np.where(np.array(names) == "k1", 2.0, 1.0)
     np.testing.assert_allclose(covariance / np.outer(factors, factors), np.cov(flat.T), rtol=1e-9)
     assert saved["fixed"]["g"] == 9.81
+    assert not saved["fixed"].keys() & set(names)
+    sloping = dataclasses.replace(wide, rig=dataclasses.replace(capsule.rig, slope=Quantity(0.05)))
+    sloping.export(tmp_path / "slope.json", draws=5)
+    # Before: level ground.
+    assert json.loads((tmp_path / "slope.json").read_text(encoding="utf-8"))["fixed"]["slope"] == 0.05
 
 
 def test_the_stored_sample_is_small(capsule: Fit, tmp_path: Path) -> None:
@@ -291,6 +297,24 @@ def test_simulate_runs_the_capsule_for_draws(capsule: Fit) -> None:
     p = cid.CapsuleParameters(**leaves, k2=one["k2[soft]"], G=1e-3)
     np.testing.assert_allclose(motion.X1, cid.simulate(p, DRIVE, TIMES).X1, rtol=1e-9, atol=1e-15)
     assert np.all(np.std(motion.X1[:, -1]) > 0.0)
+
+
+def test_simulate_takes_the_law_of_the_fit_and_says_what_it_leaves_out(capsule: Fit) -> None:
+    """Before: eq. (1) after a fit of constant friction, and any drive, any damping without a word."""
+    flat = dataclasses.replace(capsule, rig=dataclasses.replace(capsule.rig, model=ModelChoices(friction="constant")))
+    one, other = (fit.simulate(DRIVE, TIMES, draws=5, given={"v_s": 1.0, "ratio": 1.0}) for fit in (flat, capsule))
+    np.testing.assert_allclose(one.X2, other.X2, rtol=1e-9, atol=1e-15)
+    assert not np.allclose(one.X2, capsule.simulate(DRIVE, TIMES, draws=5).X2)
+    reacting = dataclasses.replace(capsule.rig, model=ModelChoices(reaction="capsule"))
+    with pytest.warns(UserWarning, match=r"the drive has reaction = 0.*; that of the fit is 1"):
+        dataclasses.replace(capsule, rig=reacting).simulate(DRIVE, TIMES, draws=5)
+    law = dataclasses.replace(capsule, provenance=dataclasses.replace(capsule.provenance, friction="mine.Law"))
+    with pytest.raises(InputError, match=r"computes with eq. \(1\)"):
+        law.simulate(DRIVE, TIMES, draws=5)
+    posterior = cast(Posterior, capsule.posterior)
+    renamed = dataclasses.replace(posterior, names=tuple("F_dry" if n == "k2[soft]" else n for n in posterior.names))
+    with pytest.warns(UserWarning, match="the capsule has no F_dry: its rod is damped by c alone"):
+        dataclasses.replace(capsule, posterior=renamed).simulate(DRIVE, TIMES, draws=5)
 
 
 def test_simulate_names_what_it_lacks(fitted: Fit, capsule: Fit) -> None:

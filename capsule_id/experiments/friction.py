@@ -175,20 +175,21 @@ def check_scatter(tables: Sequence[Table[Any]]) -> None:
     Raises
     ------
     InputError
-        If all readings are equal and no reading error is stated.
+        If readings repeat at no more settings than the law has parameters, and no reading error is stated.
     """
-    if len({tuple(table.columns) for table in tables}) != 1:
-        return
-    rows = np.concatenate([np.stack([c.values for c in t.columns.values()], axis=1) for t in tables])
-    if len(rows) < 2 or np.any(rows != rows[0]):
-        return
-    if not any(column.reading_sd > 0.0 for table in tables for column in table.columns.values()):
-        raise InputError(
-            f"{tables[0].kind} readings that are all the same need their reading step",
-            counted(len(rows), "row"),
-            f"state {next(iter(tables[0].columns))}_resolution",
-            tables[0].file,
-        )
+    for columns in dict.fromkeys(tuple(table.columns) for table in tables):
+        alike = [table for table in tables if tuple(table.columns) == columns]
+        rows = np.concatenate([np.stack([c.values for c in table.columns.values()], axis=1) for table in alike])
+        # A law through two points, mu and v_s, leaves no scatter either.
+        distinct, known = len(np.unique(rows, axis=0)), 2 if "speed" in columns else 1
+        stated = any(column.reading_sd > 0.0 for table in alike for column in table.columns.values())
+        if distinct <= known and distinct < len(rows) and not stated:
+            raise InputError(
+                f"{alike[0].kind} readings that are all the same need their reading step",
+                counted(len(rows), "row"),
+                f"state {next(name for name in columns if name not in ('speed', 'normal_force'))}_resolution",
+                alike[0].file,
+            )
 
 
 # paper: The paper's estimate of eq. (1), and its panel: coefficient against velocity (Fig. 2).

@@ -257,6 +257,17 @@ def _doubt(variants: Sequence[Variant], used: Variant, fastest: float) -> tuple[
     }
 
 
+def _corrected(e: Any, fit: Fitted) -> Any:
+    """The experiment without the errors of its instruments that the fit found: they are no property of the law."""
+    if not e.instruments:
+        return e
+    theta, columns = e.local(fit.values), dict(e.table.columns)
+    for name, _ in e.instruments:
+        factor, offset = e.instrument(name, theta)
+        columns[name] = replace(columns[name], values=(columns[name].values - offset) / factor, instrument=None)
+    return type(e)(replace(e.table, columns=columns), e.rig, e.friction)
+
+
 def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
     """Compare the friction law in use with other laws, and recommend the simplest that the readings allow.
 
@@ -269,7 +280,7 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
     in_use = replace(experiments[0].friction, direction="both", contact=None) if experiments else FrictionModel()
     if in_use.law is not CoulombStribeck or sum(e.n for e in experiments if e.role != "static") < FEWEST_SLIDES:
         return []
-    points = VariantPoints(experiments)
+    points = VariantPoints([_corrected(e, fit) for e in experiments])
     variants = [fit_variant(points, model, SEED) for model in candidates(experiments)]
     highest = max(variant.evidence for variant in variants)
     used = next(variant for variant in variants if variant.model == in_use)

@@ -81,6 +81,14 @@ def _profiles(target: LogPosterior, fit: PointFit, names: Sequence[str], values:
     return found
 
 
+def _end(value: np.ndarray, height: np.ndarray) -> str:
+    """Where a profile first falls by ``DROP``, from its top on; open where it does not."""
+    if not np.any(below := height < -DROP):
+        return "open"
+    near = [int(np.argmax(below)), int(np.argmax(below)) - 1]
+    return f"{np.interp(-DROP, height[near], value[near]):.5g}"
+
+
 def profile_tables(target: LogPosterior, fit: PointFit, names: Sequence[str]) -> list[ResultTable]:
     """A table of the report for each profiled parameter; see ``profile``."""
     tables = []
@@ -88,10 +96,8 @@ def profile_tables(target: LogPosterior, fit: PointFit, names: Sequence[str]) ->
         frame = profile(target, fit, name)
         value, height = frame["value"].to_numpy(), frame["profile"].to_numpy()
         top = int(np.argmax(height))
-        # An end that lies beyond the values is open.
-        lower = np.interp(-DROP, height[: top + 1], value[: top + 1], left=np.nan)
-        upper = np.interp(DROP, -height[top:], value[top:], right=np.nan)
-        ends = ["open" if np.isnan(end) else f"{end:.5g}" for end in (lower, upper)]
+        sides = slice(top, None, -1), slice(top, None)
+        ends = [_end(value[side], height[side]) for side in sides]
         row = target.parameters[target.names.index(name)]
         facts = {"name": name, "unit": row.unit, "lower": ends[0], "upper": ends[1], "drop": DROP}
         tables.append(ResultTable("parameters.profile", frame.set_index("value"), facts))

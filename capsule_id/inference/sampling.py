@@ -330,10 +330,7 @@ def sample(
                 if chains is not None:
                     chains.between_draws()
                 report(done, ENSEMBLES * goal, "sampling")
-            # Each proposal brings a draw of its scatters, which is accepted without regard to it.
-            located = np.stack([sampler.chain[:goal] for sampler in samplers])
-            factors = np.stack([sampler.parts[:goal] for sampler in samplers])
-            draws, lp = target.whole(located, factors.reshape(*factors.shape[:3], len(target.blocks), -1))
+            draws, lp = _completed(target, samplers, goal)
             if _converged(draws, ess):
                 break
         if chains is not None:
@@ -356,6 +353,16 @@ def sample(
         steps=draws.shape[1] * schedule.thin,
         thin=schedule.thin,
     )
+
+
+def _completed(target: MarginalPosterior, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first ``goal`` draws (ensemble, draw, walker, d) with scatters, and their log-posterior.
+
+    Each proposal brings a draw of its scatters, which is accepted without regard to it.
+    """
+    located = np.stack([sampler.chain[:goal] for sampler in samplers])
+    factors = np.stack([sampler.parts[:goal] for sampler in samplers])
+    return target.whole(located, factors.reshape(*factors.shape[:3], len(target.blocks), -1))
 
 
 def _converged(draws: np.ndarray, ess: float) -> bool:

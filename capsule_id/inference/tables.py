@@ -60,7 +60,9 @@ def shared_symbols(target: LogPosterior) -> set[str]:
 def _sd(fit: PointFit | None, sample: Posterior | None, name: str) -> float:
     if sample is not None and name in sample.names:
         return float(np.std(sample.draws[..., sample.names.index(name)], ddof=1))
-    return np.nan if fit is None else fit.standard_errors.get(name, np.nan)
+    if fit is None or name not in fit.names:
+        return float("nan")
+    return fit.standard_errors[name]
 
 
 def smoothing_certificate(target: LogPosterior, fit: PointFit) -> ResultTable:
@@ -161,15 +163,9 @@ def make_notes(
         for row in target.parameters
         if row.prior is not None
     ]
-    tables = [
-        *of_runs,
-        *of_bench,
-        *compared,
-        *([] if kinked else share_table(target, fit)),
-        *identified(target, fit),
-        *profile_tables(target, fit, profiled),
-        ResultTable("parameters.priors", pd.DataFrame(priors).set_index("parameter")),
-    ]
+    tables = [*of_runs, *of_bench, *compared, *([] if kinked else share_table(target, fit))]
+    tables += [*identified(target, fit), *profile_tables(target, fit, profiled)]
+    tables.append(ResultTable("parameters.priors", pd.DataFrame(priors).set_index("parameter")))
     if sampled.draws:
         # Experiments on the shared friction panel have a p-value too.
         rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in sampled.experiments}
@@ -236,16 +232,9 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
         if posterior is not None:
             draws = posterior.draws[..., i].ravel()
             lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
-            entry |= {
-                "value": median,
-                "sd": np.std(draws, ddof=1),
-                "basis": "sample",
-                "mean": np.mean(draws),
-                "median": median,
-                "lower": lower,
-                "upper": upper,
-                **{name: getattr(posterior, name)[i] for name in ("ess", "ess_bulk", "ess_tail", "rhat")},
-            }
+            entry |= {"value": median, "sd": np.std(draws, ddof=1), "basis": "sample"}
+            entry |= {"mean": np.mean(draws), "median": median, "lower": lower, "upper": upper}
+            entry |= {name: getattr(posterior, name)[i] for name in ("ess", "ess_bulk", "ess_tail", "rhat")}
         entry |= _widened(entry, sampled.widened.get(row.name), row.positive)
         entry |= _limited(entry) if row.positive else {}
         rows.append((row, {**entry, "quote": quote(entry, row.positive)}))

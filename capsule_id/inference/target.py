@@ -316,7 +316,8 @@ class LogPosterior(eqx.Module):
             for row in experiment.parameters:
                 offered.setdefault(row.name, []).append(row)
         for name, (row, *others) in offered.items():
-            prior = rig.priors.get(name)
+            # Of a bracketed name [prior] holds the symbol alone, but for k2.
+            prior = rig.priors.get(name, rig.priors.get(row.symbol))
             if others and prior is None:
                 prior = covering_prior(name, [prior_of(one) for one in (row, *others)])
             rows.setdefault(name, row if prior is None else row.named(row.of, prior))

@@ -130,7 +130,7 @@ def model_json(result: Result, draws: Mapping[str, np.ndarray]) -> dict[str, obj
     names = [str(name) for name in result.summary.index if name in posterior.names]
     own = result.summary.loc[names]
     columns = np.stack([posterior.draws[..., posterior.names.index(name)].ravel() for name in names])
-    sd = own["sd"].to_numpy(float)
+    sd, held = own["sd"].to_numpy(float), {**held_leaves(result.rig), **result.fixed}
     content = {
         "format": "capsule-id model 1",
         "rig": result.rig.name,
@@ -141,7 +141,7 @@ def model_json(result: Result, draws: Mapping[str, np.ndarray]) -> dict[str, obj
             {"name": name, **{key: own.at[name, key] for key in ("unit", "value", "sd", "trust", "widening")}}
             for name in names
         ],
-        "fixed": {**result.fixed, "g": result.rig.g.value},
+        "fixed": {name: x for name, x in held.items() if x is not None and name not in names},
         "covariance": np.atleast_2d(np.corrcoef(columns)) * np.outer(sd, sd),
         "draws": np.column_stack([draws[name] for name in names]),
     }

@@ -201,6 +201,9 @@ def _read_priors(
                     f"write {' or '.join(f'k2[{name}]' for name in springs)}" if springs else "remove it",
                     of_key=True,
                 )
+            if key.startswith("k2") and not spring:
+                name = f'"k2[{springs[0] if springs else "soft"}]"'
+                raise node.error("a prior of k2 must name a spring of an experiment", key, f"write {name}", of_key=True)
             if not spring:
                 replace(entries, value={key: node.value}).refuse_unknown(known)
             row = rows["k2" if spring else key]

@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 import capsule_id as cid
+from capsule_id.errors import InputError
 from capsule_id.experiments import friction_variants
 from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.friction import FrictionExperiment, paper_friction_fit
@@ -47,6 +48,61 @@ def twin(seed: int, n: int, law: CoulombStribeck) -> list[FrictionExperiment]:
 
 def findings(points: list[FrictionExperiment]) -> dict[str, Finding]:
     return {finding.code: finding for finding in check_variants(points, None)}  # type: ignore[arg-type]
+
+
+def test_the_stated_error_of_an_instrument_is_no_property_of_the_law(tmp_path: Path) -> None:
+    """Before: right values failed, and the remedy freed a ratio that the truth does not have. Control: not stated."""
+    rng, speed = np.random.default_rng(2), np.geomspace(0.05, 1.0, 12)
+    load = np.linspace(8.0, 1.5, 12)  # light loads slide faster
+    law = CoulombStribeck(0.65, 1.0, 0.3)
+    force = 0.25 + load * law.forward(speed) * (1.0 + 0.01 * rng.standard_normal(12))
+    lines = {
+        "tilt.csv": ["angle [deg]", *(f"{x:.6g}" for x in np.rad2deg(np.arctan(0.65)) + 0.3 * rng.standard_normal(8))],
+        "slide.csv": [
+            "speed [m/s],force [N],normal_force [N]",
+            *(f"{v:.6g},{f:.6g},{n:.6g}" for v, f, n in zip(speed, force, load, strict=True)),
+        ],
+    }
+    for name, rows in lines.items():
+        (tmp_path / name).write_text("\n".join(rows))
+    toml = (
+        '[rig]\nname = "f"\n[[experiment]]\nkind = "static_friction"\nfile = "tilt.csv"\n'
+        'angle_resolution = { value = 0.01, unit = "deg" }\n[[experiment]]\nkind = "sliding_friction"\nfile = "slide.csv"\n'
+        'force_sd = { value = 0.005, unit = "N" }\n'
+    )
+    cell = 'force_instrument = "cell"\n[[instrument]]\nname = "cell"\noffset = { sd = 0.5, unit = "N" }\n'
+    for more, level in ((cell, "ok"), ("", "fail")):
+        (tmp_path / "rig.toml").write_text(toml + more)
+        result = cid.fit(cid.read_rig(tmp_path), budget=None)
+        (found,) = [finding for finding in result.findings if finding.code == "friction.variants"]
+        assert found.level == level
+        if more:
+            assert result.summary.at["v_s", "map"] == pytest.approx(0.3, abs=0.04)
+
+
+@pytest.mark.parametrize(
+    ("kind", "tables", "resolution"),
+    [
+        ("sliding_friction", ["speed [m/s],coefficient [1]\n0.1,0.55\n0.1,0.55\n0.4,0.42\n0.4,0.42\n"], "coefficient"),
+        ("static_friction", ["angle [deg]\n33\n33\n33\n", "force [N],normal_force [N]\n3.1,5\n3.2,5\n"], "angle"),
+    ],
+)
+def test_readings_that_leave_no_scatter_need_their_step(
+    tmp_path: Path, kind: str, tables: list[str], resolution: str
+) -> None:
+    """Before: a traceback, or a remedy about drift and noise, where rows repeat at two speeds or other tables differ."""
+    toml = '[rig]\nname = "equal"\n'
+    for i, text in enumerate(tables):
+        (tmp_path / f"{i}.csv").write_text(text)
+        toml += f'[[experiment]]\nkind = "{kind}"\nfile = "{i}.csv"\n'
+        toml += "# step\n" if i == 0 else ""
+    (tmp_path / "rig.toml").write_text(toml)
+    with pytest.raises(InputError, match=f"need their reading step, .* rows, state {resolution}_resolution"):
+        make_experiments(cid.read_rig(tmp_path))
+    unit = "deg" if resolution == "angle" else "1"
+    step = f'{resolution}_resolution = {{ value = 0.01, unit = "{unit}" }}'
+    (tmp_path / "rig.toml").write_text(toml.replace("# step", step))
+    assert make_experiments(cid.read_rig(tmp_path))
 
 
 @pytest.mark.parametrize(("constant", "ratio"), [(True, 1.0), (False, 0.5)])

@@ -23,6 +23,7 @@ from capsule_id.inference.prediction import LeftOut, WeightedDraws
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
 from capsule_id.synthetic import RobotDesign, synthesize_robot
+from tests.experiments import bench
 from tests.inference.three_settings import PERIODS, THETA, three_settings
 
 
@@ -206,6 +207,17 @@ def test_the_command_compares_by_points_where_nothing_is_to_be_sampled(
     for words, called in (([], "compare_models"), (["--no-sample"], "compare_points")):
         assert fit_params([str(rig.folder), "--compare", "lag", "--quiet", *words]) == 0
         assert capsys.readouterr().out.strip() == called
+
+
+def test_a_law_that_the_readings_of_a_slide_cannot_have_is_not_compared(rig: Rig) -> None:
+    """Before: slides without a speed counted as break-away, and a viscous force was scaled with the load of each row."""
+    force = np.array([1.3, 2.7, 3.9])
+    slide = bench.table("sliding_friction", [bench.column("force", force), bench.column("normal_force", 2.0 * force)])
+    flat = replace(rig, tables=(*rig.tables, slide), model=ModelChoices(friction="constant"))
+    assert "eq. (1)" in compare._variants(replace(flat, tables=rig.tables), ["friction"], None)[0]
+    names = set(compare._variants(flat, ["friction"], None)[0])
+    assert names == {"as stated", "direction"} & names
+    assert "as stated" in names
 
 
 @pytest.mark.full

@@ -12,7 +12,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.inference.marginal import density_of
 from capsule_id.inference.point_fit import point_fit
-from capsule_id.inference.profiles import DROP, identified, profile, profile_tables
+from capsule_id.inference.profiles import DROP, _end, identified, profile, profile_tables
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from tests.cli_tools import small_rig
@@ -49,6 +49,15 @@ def _decay(folder: Path, c: float, m1_sd: float) -> Path:
     (folder / "decay.csv").write_text(f"time [s],x_rel [mm]\n{rows}", encoding="utf-8")
     (folder / "rig.toml").write_text(HEAD % m1_sd + DECAY, encoding="utf-8")
     return folder
+
+
+def test_an_interval_ends_where_the_profile_first_falls() -> None:
+    """Before: some number, where a second hump lies beyond. Against the crossing of a parabola."""
+    value = np.linspace(0.0, 8.0, 161)
+    height = np.maximum(-0.5 * value**2, -0.5 * (value - 6.0) ** 2 - 0.5)
+    height[value > 4.0] = np.maximum(height[value > 4.0], -1.0)
+    assert float(_end(value, height)) == pytest.approx(np.sqrt(2.0 * DROP), abs=2e-3)
+    assert _end(value[:20], height[:20]) == "open"
 
 
 def test_a_profile_is_the_ridge_of_a_grid(tmp_path: Path) -> None:

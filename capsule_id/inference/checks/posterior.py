@@ -211,7 +211,7 @@ def modes(u: np.ndarray, size: float) -> list[tuple[float, float]]:
     count as one where the valley is shallower than ``DEEPEST_VALLEY`` or one of them is lighter than ``SMALLEST_MODE``.
     """
     low, high = np.quantile(u, [0.0005, 0.9995])
-    if not high > low:
+    if not high - low > BINS * np.spacing(max(abs(low), abs(high))):  # nothing but rounding
         return [(float(np.median(u)), 1.0)]
     count, edges = np.histogram(u, BINS, (low, high))
     spread = min(float(np.std(u)), float(np.subtract(*np.quantile(u, [0.75, 0.25]))) / 1.34)

@@ -20,6 +20,7 @@ from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.static_friction import TILT_SD
+from capsule_id.experiments.transducer import SENSITIVITY
 from capsule_id.inference.marginal import density_of, left_out
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import TABLE, Parameter, Prior, parameter
@@ -99,6 +100,17 @@ def test_stated_priors_that_differ_are_refused_and_one_in_rig_toml_settles_it() 
     settled = Prior("normal", 2.0, 1.0)
     target = LogPosterior(replace(rig_without_tables(), priors={"P_on": settled}), own)
     assert target.parameters[0].prior == settled
+
+
+def test_a_prior_in_rig_toml_holds_for_every_index_of_its_symbol() -> None:
+    """Before: that of ``sensitivity`` was read and never used, and a value far outside it was trusted."""
+    stated = Prior("lognormal", 50.0, 1.001)
+    rows = [SENSITIVITY.named(of) for of in ("one", "other")]
+    target = LogPosterior(replace(rig_without_tables(), priors={"sensitivity": stated}), [Nothing(rows)])
+    assert [row.prior for row in target.parameters] == [stated, stated]
+    springs = [parameter("k2", of, Prior("lognormal", 100.0, 10.0)) for of in ("one", "other")]
+    target = LogPosterior(replace(rig_without_tables(), priors={"k2[one]": stated}), [Nothing(springs)])
+    assert [row.prior == stated for row in target.parameters] == [True, False]
 
 
 def test_joint_prior_is_the_sum() -> None:
