@@ -237,7 +237,8 @@ class Fit(Result):
 
         Parameters
         ----------
-        drive : such as ``Excitation(P_d=4.0, Omega=34.56)``
+        drive : such as ``Excitation(P_d=4.0, Omega=34.56)``; another ``reaction`` than that of [model] is a warning, and so is
+            damping of the fit (F_dry, c_q) that the capsule does not have
         times : (n,) s, increasing
         draws : number of draws, taken at random without repetition
         spring : name of the support spring, k2[spring]; None: no support spring
@@ -248,7 +249,8 @@ class Fit(Result):
         Raises
         ------
         InputError
-            If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter or the gap is missing.
+            If nothing was sampled, there are fewer draws, the fit has another friction law than eq. (1) or constant
+            friction, the spring was not fitted, or a parameter or the gap is missing.
         """
         chosen = random_draws(self, draws, np.random.default_rng(seed))
         constant = self.rig.model.friction == "constant"
