@@ -62,6 +62,8 @@ def capsule_values(
         If a value is missing, no number or not admissible, belongs to another drive, or the result cannot be read.
     """
     fitted = leaves_of(fitted_values(args.result), args.spring) if args.result is not None else {}
+    # What the folder does not decide must be given, but for what is varied.
+    fitted = {name: x for name, x in fitted.items() if x is not None or name not in free}
     known = {**dict.fromkeys(free, 1.0), **defaults, **fitted}
     values = {}
     own = {*CAPSULE_LEAVES, *DRIVES[args.drive]}

@@ -180,8 +180,10 @@ def check_scatter(tables: Sequence[Table[Any]]) -> None:
     for columns in dict.fromkeys(tuple(table.columns) for table in tables):
         alike = [table for table in tables if tuple(table.columns) == columns]
         rows = np.concatenate([np.stack([c.values for c in table.columns.values()], axis=1) for table in alike])
-        # A law through two points, mu and v_s, leaves no scatter either.
+        # A law through two points, mu and v_s, leaves no scatter either; readings of one setting that differ do.
+        settings = rows[:, [name in ("speed", "normal_force") for name in columns]]
         distinct, known = len(np.unique(rows, axis=0)), 2 if "speed" in columns else 1
+        distinct = distinct if distinct == len(np.unique(settings, axis=0)) else len(rows)
         stated = any(column.reading_sd > 0.0 for table in alike for column in table.columns.values())
         if distinct <= known and distinct < len(rows) and not stated:
             raise InputError(

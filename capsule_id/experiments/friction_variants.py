@@ -264,7 +264,10 @@ def _corrected(e: Any, fit: Fitted) -> Any:
     theta, columns = e.local(fit.values), dict(e.table.columns)
     for name, _ in e.instruments:
         factor, offset = e.instrument(name, theta)
-        columns[name] = replace(columns[name], values=(columns[name].values - offset) / factor, instrument=None)
+        values = (columns[name].values - offset) / factor
+        if np.any(values <= 0.0):  # a point of the paper is positive
+            return e
+        columns[name] = replace(columns[name], values=values, instrument=None)
     return type(e)(replace(e.table, columns=columns), e.rig, e.friction)
 
 

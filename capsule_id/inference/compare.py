@@ -273,7 +273,9 @@ def _table(rows: dict[str, dict[str, Any]], criterion: str) -> pd.DataFrame:
 
 def _variants(rig: Rig, words: Sequence[str], registry: Registry | None) -> tuple[dict[str, ModelChoices], Registry]:
     """Variants by name, and the kinds that read ``rig``; an ``InputError`` where its progressions do not suffice."""
-    kinds, slides = registry or default_registry(), [set(t.columns) for t in rig.tables if t.kind == "sliding_friction"]
+    kinds = registry or default_registry()
+    read = make_experiments(rig, "all", kinds)
+    slides = [set(e.table.columns) for e in read if getattr(e, "role", "") == "sliding"]
     choices = {
         name: model
         for name, model in variants_of(rig, words).items()
@@ -281,7 +283,7 @@ def _variants(rig: Rig, words: Sequence[str], registry: Registry | None) -> tupl
         if not ("viscous" in model.free and any("normal_force" in own or "speed" not in own for own in slides))
         and (model.friction == "constant" or all("speed" in own for own in slides))
     }
-    made = [e for e in make_experiments(rig, "all", kinds) if isinstance(e, Progression)]
+    made = [e for e in read if isinstance(e, Progression)]
     if not made:
         raise InputError(
             "--compare needs a progression", "none", "compare friction laws of bench tests in the report of fit-params"

@@ -87,7 +87,7 @@ class Candidate:
         located = target.located
         rows = [target.parameters[i] for i in located]
         # What belongs to the run of a part is new in a new run too.
-        own_names = {e.label, e.shares_noise}
+        own_names = {e.label, e.shares_noise, *(f"{e.shares_noise}_{column}" for column in e.table.columns)}
         kept = [row.of not in own_names or (row.physical and isinstance(e, PointTest)) for row in rows]
         shared = np.array([row.name in names and keep for row, keep in zip(rows, kept, strict=True)])
         place = [names.index(row.name) for row, keep in zip(rows, shared, strict=True) if keep]
@@ -325,7 +325,10 @@ def lines_of(e: Experiment, kind: Kind) -> str:
         rule = QuantityRule("s" if column.name == "time" else kind.columns[column.name].si)
         errors = {"sd": column.sd, "resolution": column.resolution}
         shown |= {f"{column.name}_{key}": _text(x, rule) for key, x in errors.items() if x is not None}
-        shown |= {f"{column.name}_instrument": json.dumps(column.instrument.name)} if column.instrument else {}
+        if column.instrument and column.instrument.name == f"{e.shares_noise}_{column.name}":  # of the parts of a run
+            shown[f"{column.name}_gain_sd"] = _text(column.instrument.errors["gain"].sd, QuantityRule("1"))
+        elif column.instrument:
+            shown[f"{column.name}_instrument"] = json.dumps(column.instrument.name)
     header = ", ".join(f"{column.name} [{column.unit}]" for column in columns)
     return "\n".join(["[[experiment]]", *(f"{key} = {text}" for key, text in shown.items()), f"# columns: {header}"])
 

@@ -19,16 +19,15 @@ STATED = "stated value of "
 def held_leaves(rig: Rig) -> dict[str, float | None]:
     """Leaves of capsule and drive that ``rig`` states in [rig], [model] or its runs, SI, by symbol.
 
-    None: its runs have several values of the lag, loads of their own, or square waves, whose force between the pulses is
-    that of no other pulses. Fitted values come before these.
+    None: its runs have several lags, or square waves, whose force between the pulses is that of no other pulses. Fitted
+    values come before these.
     """
     stated = ((name, getattr(rig, name)) for name in ("m1", "m2", "g", "slope", "N0"))
     values: dict[str, float | None] = {"reaction": rig.model.share_of_reaction, "slope": 0.0, "N0": 0.0}
     values |= {name: quantity.value for name, quantity in stated if quantity is not None}
     driven = [table.settings for table in rig.tables if hasattr(table.settings, "drive")]
-    lags = {one.lag.value for one in driven if getattr(one, "lag", None) is not None}
+    lags = {0.0 if one.lag is None else one.lag.value for one in driven if one.drive in ("pulses", "square")}
     values |= {"lag": lags.pop() if len(lags) == 1 else None} if lags else {}
-    values |= {"N0": None} if any(getattr(one, "normal_force", None) is not None for one in driven) else {}
     return values | ({"P_off": None} if any(one.drive == "square" for one in driven) else {})
 
 

@@ -107,6 +107,11 @@ def prior_sd(row: Parameter) -> float:
     return prior.spread
 
 
+def stated_prior(rig: Rig, row: Parameter) -> Prior | None:
+    """The prior that [prior] states for a parameter; of a bracketed name it holds the symbol alone, but for k2."""
+    return rig.priors.get(row.name, rig.priors.get(row.symbol))
+
+
 def covering_prior(name: str, priors: Sequence[Prior]) -> Prior:
     """Return the prior of a parameter that several experiments share, whatever their order.
 
@@ -316,8 +321,7 @@ class LogPosterior(eqx.Module):
             for row in experiment.parameters:
                 offered.setdefault(row.name, []).append(row)
         for name, (row, *others) in offered.items():
-            # Of a bracketed name [prior] holds the symbol alone, but for k2.
-            prior = rig.priors.get(name, rig.priors.get(row.symbol))
+            prior = stated_prior(rig, row)
             if others and prior is None:
                 prior = covering_prior(name, [prior_of(one) for one in (row, *others)])
             rows.setdefault(name, row if prior is None else row.named(row.of, prior))

@@ -12,6 +12,7 @@ from scipy.optimize import differential_evolution
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.declaration import RunSettings
+from capsule_id.experiments.friction_model import ground_parameters
 from capsule_id.experiments.progression.declaration import AMPLITUDE, ProgressionSettings, settings_of
 from capsule_id.inference.prediction import random_draws, require_equation_1
 from capsule_id.inference.result import Result, held_leaves
@@ -253,6 +254,8 @@ def _leaves(
     # Without a support spring the rod moves freely.
     values |= {"k2": 0.0, "G": np.inf} if not front and not {"k2", "G"} & {*given, *searched} else {}
     progressions = [table.settings for table in rig.tables if isinstance(table.settings, ProgressionSettings)]
+    # Friction under a load of a run's own is not that under the weight.
+    values |= {"N0": None} if any(run.normal_force is not None for run in runs) else {}
     stated = {quantity.value for one in progressions if (quantity := getattr(one, AMPLITUDE[drive])) is not None}
     values |= {AMPLITUDE[drive]: stated.pop()} if len(stated) == 1 else {}
     differ = len({(run.spring_back, run.gap_back) for run in runs}) > 1
@@ -278,8 +281,10 @@ def _fitted(result: Result, chosen: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _value(chosen: Mapping[str, np.ndarray], symbol: str, table: Table[Any], stated: Quantity) -> Any:
-    """The fitted value of a setting of a run, (draws,), else the ``stated`` one."""
-    return chosen.get(f"{symbol}[{table.label}]", chosen.get(symbol, stated.value))
+    """The fitted value of a setting of a run, (draws,); the ``stated`` one where it is exact or was not fitted."""
+    return (
+        stated.value if stated.sd == 0.0 else chosen.get(f"{symbol}[{table.label}]", chosen.get(symbol, stated.value))
+    )
 
 
 def _behind(table: Table[Any], chosen: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -299,10 +304,11 @@ def operating_points(result: Result, chosen: Mapping[str, np.ndarray], drive: st
         settings = table.settings
         if not isinstance(settings, RunSettings | ProgressionSettings) or settings.drive != drive:
             continue
-        ground = {name: _value(chosen, name, table, quantity) for name, quantity in settings.ground.items()}
-        # A stated 0 differs from [rig] too.
-        ground = {name: 0.0 for name in ("slope", "N0") if getattr(settings, name) is not None} | ground
-        ground |= {"lag": settings.lag.value} if settings.lag is not None and "lag" not in chosen else {}
+        # Equal statements of several runs have the name of the first; a stated 0 differs from [rig] too.
+        names = {row.symbol: row.name for row in ground_parameters(table, result.rig)}
+        ground = {name: 0.0 for name in ("slope", "N0") if getattr(settings, name) is not None}
+        ground |= {name: chosen.get(names.get(name, ""), stated.value) for name, stated in settings.ground.items()}
+        ground |= {} if settings.lag is None else {"lag": _value(chosen, "lag", table, settings.lag)}
         if isinstance(settings, ProgressionSettings):
             rows, source = settings_of(table.columns, settings)
             speed = table["distance"] / (rows[:, 0] * rows[:, 1])

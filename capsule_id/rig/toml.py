@@ -53,6 +53,8 @@ POSITIVE = Domain("be greater than 0", low=0.0)
 NOT_NEGATIVE = Domain("be 0 or greater", low=0.0, closed=True)
 #: A share, both ends included: the bound lies a rounding error of unit conversion above 1.
 SHARE = Domain("lie between 0 and 100 %", low=0.0, high=1.0 + ROUNDING, closed=True)
+#: A part of a whole, neither none of it nor all.
+PART = Domain("lie between 0 and 100 %, both excluded", low=0.0, high=1.0)
 ABOVE_ONE = Domain("be greater than 1", low=1.0)
 #: A number of drive periods; the simulation of more takes minutes for each trial.
 PERIODS = Domain("lie between 1 and 100000", low=1.0, high=1e5, closed=True)

@@ -82,6 +82,8 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     pulses = ["--drive", "pulses", "--G", "inf", "--P_on", "1", "--period", "0.1", "--duty", "0.5", *drive[-4:]]
     with pytest.raises(InputError, match=r"P_off .* must be given"):
         command.capsule_values(parser.parse_args(pulses))
+    # What is varied needs no value.
+    assert command.capsule_values(parser.parse_args(pulses), free=frozenset({"P_off"}))["P_off"] == 0.0
     values = command.capsule_values(parser.parse_args([*pulses, "--P_off", "-1"]))
     assert (values["lag"], values["P_off"]) == (0.006, -1.0)
     other = {"parameters": rows, "provenance": {"friction": "mine.Law"}}

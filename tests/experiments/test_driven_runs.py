@@ -182,7 +182,9 @@ RECORDED = 'drive = "recorded"\n'
             RECORDED + 'x_rel_delay_sd = { value = 1, unit = "ms" }\n',
         ),
         # Before: pulses that are always on.
-        (PULSES.replace('unit = "%"', 'unit = "1"'), "duty must lie between 0 and 100 %", PULSES),
+        (PULSES.replace('unit = "%"', 'unit = "1"'), "duty must lie between 0 and 100 %, both excluded", PULSES),
+        (PULSES.replace("value = 40", "value = 0"), "duty must lie between 0 and 100 %", PULSES),
+        (PULSES.replace("value = 40", "value = 100"), "duty must lie between 0 and 100 %", PULSES),
     ],
 )
 def test_what_would_have_no_effect_is_refused(tmp_path: Path, settings: str, rule: str, instead: str) -> None:

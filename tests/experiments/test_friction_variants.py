@@ -4,6 +4,7 @@ import dataclasses
 import tracemalloc
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -103,6 +104,38 @@ def test_readings_that_leave_no_scatter_need_their_step(
     step = f'{resolution}_resolution = {{ value = 0.01, unit = "{unit}" }}'
     (tmp_path / "rig.toml").write_text(toml.replace("# step", step))
     assert make_experiments(cid.read_rig(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("sliding_friction", "speed [mm/s],force [N],normal_force [N]\n" + "10,2.4,6\n10,2.5,6\n" * 3),
+        ("sliding_friction", "speed [m/s],coefficient [1]\n0.1,0.55\n0.1,0.54\n0.1,0.55\n"),
+        ("static_friction", "force [N],normal_force [N]\n3.1,5\n3.1,5\n6.2,10\n"),
+    ],
+)
+def test_readings_of_one_setting_that_differ_are_a_scatter(tmp_path: Path, kind: str, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    head = '[rig]\nname = "a"\n[model]\nfriction = "constant"\n'
+    (tmp_path / "rig.toml").write_text(f'{head}[[experiment]]\nkind = "{kind}"\nfile = "a.csv"\n')
+    assert make_experiments(cid.read_rig(tmp_path))
+
+
+def test_a_reading_below_the_zero_of_its_cell_does_not_stop_the_comparison(tmp_path: Path) -> None:
+    """Its corrected coefficient would be negative, and the sampler of laws would not end."""
+    speed, load = np.geomspace(0.05, 1.0, 10), np.full(10, 2.0)
+    force = 0.3 + load * CoulombStribeck(0.3, 1.0, 0.3).forward(speed)
+    force[-1] = 0.12
+    rows = [f"{v:.6g},{f:.6g},{n:.6g}" for v, f, n in zip(speed, force, load, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["speed [m/s],force [N],normal_force [N]", *rows]))
+    (tmp_path / "rig.toml").write_text(
+        '[rig]\nname = "a"\n[[experiment]]\nkind = "sliding_friction"\nfile = "a.csv"\nforce_instrument = "cell"\n'
+        '[[instrument]]\nname = "cell"\noffset = { value = 0, sd = 0.5, unit = "N" }\n'
+    )
+    (e,) = make_experiments(cid.read_rig(tmp_path))
+    values = {"mu": 0.3, "v_s": 0.3, "sliding_scatter": 0.01, "offset[cell]": 0.3}
+    points = SimpleNamespace(values=values)
+    assert {finding.code for finding in check_variants([e], points)} == {"friction.variants", "friction.order"}  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("constant", "ratio"), [(True, 1.0), (False, 0.5)])

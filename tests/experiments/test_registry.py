@@ -39,7 +39,7 @@ from capsule_id.rig.schema import (
     SettingRule,
     WordsRule,
 )
-from capsule_id.rig.toml import ANY, NOT_NEGATIVE, POSITIVE, SHARE, Node
+from capsule_id.rig.toml import ANY, NOT_NEGATIVE, PART, POSITIVE, Node
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Message
 from tests.cli_tools import ROOT
@@ -103,7 +103,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "Omega": (QuantityRule("rad/s"), None),
         "f": (QuantityRule("Hz"), None),
         "P_d": (QuantityRule("N", has_sd=True), None),
-        "duty": (QuantityRule("1", SHARE), None),
+        "duty": (QuantityRule("1", PART), None),
         "P_on": (_FORCE, None),
         "lag": (_LAG, None),
         "normal_force": (QuantityRule("N"), None),

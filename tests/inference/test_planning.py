@@ -148,6 +148,11 @@ def test_a_part_of_a_run_leaves_the_drive_of_a_new_run_as_unknown_as_the_whole_d
     names = [target.names[i] for i in target.located]
     monkeypatch.setattr(Candidate, "_of_run", lambda _, target, draws: [np.eye(len(names))])
     (found,) = Candidate(part, "", 1, 1.0, 1.0, {}, {}).information([{}], names)
+    own = replace(part.table, settings=replace(part.table.settings, segment=0.2))
+    gained = ForcedRun(replace(own, settings=replace(own.settings, x_rel_gain_sd=0.02)), part.rig).parts(0.1)[0]
+    lines = planning.lines_of(gained, REGISTRY["forced_run"])
+    assert "x_rel_gain_sd = { value = 0.02" in lines
+    assert "x_rel_instrument" not in lines
     known = {name for name, diagonal in zip(names, np.diag(found), strict=True) if diagonal > 0.0}
     assert known == {"k1", "c", "mu", "v_s", "K", "k2[stiff]", "m1", "m2"} & set(names)
 

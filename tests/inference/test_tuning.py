@@ -193,6 +193,21 @@ def test_operating_points_are_those_of_the_fitted_rig(tmp_path: Path) -> None:
                 assert settings.get(name, 0.0) == 0.0
             else:
                 np.testing.assert_allclose(settings[name], value, rtol=1e-12)
+    # Exact words of a run come before what others measured; equal statements have the name of the first run.
+    sampled = {**chosen, "slope": np.full(2, 0.04), "slope[run_1]": np.full(2, 0.03)}
+    for stated, label, expected in (
+        (Quantity(0.1), "run_1", 0.1),
+        (Quantity(0.0), "run_1", 0.0),
+        (Quantity(0.1, 0.01), "run_3", 0.03),
+        (Quantity(0.05, 0.01), "run_3", 0.04),
+    ):
+        tables = [replace(t, settings=replace(t.settings, slope=stated)) for t in rig.tables if t.kind == "forced_run"]
+        own_rig = replace(rig, tables=tuple(tables), slope=Quantity(0.05, 0.01))
+        points = operating_points(
+            fit_of(TRUTH, rig=own_rig), {**sampled, "k2[stiff]": sampled["k2[medium]"]}, "harmonic"
+        )
+        found = {name: settings for name, settings, _ in points}
+        np.testing.assert_allclose(found.get(label, points[0][1])["slope"], expected)
     known = _fitted(fit_of(TRUTH, rig=rig), chosen)
     assert (known["slope"], known["reaction"]) == (0.05, 0.0)
     assert known["m2"] is chosen["m2"]
@@ -210,10 +225,11 @@ def test_the_leaves_that_a_folder_states(tmp_path: Path) -> None:
         tables = tuple(replace(t, settings=replace(t.settings, **own)) for t, own in pairs)
         return held_leaves(replace(rig, tables=tables, slope=Quantity(0.05), model=ModelChoices(reaction="capsule")))
 
-    lag = {"lag": Quantity(0.006)}
+    lag = {"drive": "pulses", "lag": Quantity(0.006)}
     assert of(lag, lag) == {**held_leaves(rig), "reaction": 1.0, "slope": 0.05, "lag": 0.006}
-    assert of(lag, {"lag": Quantity(0.004)})["lag"] is None
-    assert of({"normal_force": 3.0}, {})["N0"] is None
+    assert of(lag, {"drive": "pulses", "lag": Quantity(0.004)})["lag"] is None
+    assert of(lag, {"drive": "pulses"})["lag"] is None
+    assert of({"normal_force": 3.0}, {})["N0"] == 0.0
     assert of({"drive": "square"}, {})["P_off"] is None
 
 

@@ -18,8 +18,8 @@ from capsule_id.records.view import describe_run
 from capsule_id.rig.filters import median_step, uneven_sampling
 from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, Entry, QuantityRule, SupportSettings
-from capsule_id.rig.toml import ANY, NOT_NEGATIVE, SHARE
-from capsule_id.views import Facts, Finding, Message, stated_p
+from capsule_id.rig.toml import ANY, NOT_NEGATIVE, PART
+from capsule_id.views import Facts, Finding, Message, filled_in, stated_p
 
 # rules: Rules on the drive of a forced run: what each kind of drive needs, and what it does not have.
 
@@ -197,9 +197,11 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     except InputError:
         return
     off = 0.0 if drive is None else drive.Omega / drive.stated_Omega - 1.0
+    # The drift that would explain it, of the clock as it is without the one that is stated.
+    drift = (1.0 + table.drift.value) * (1.0 + off) - 1.0
     # A fit with a stated sd of the clock measures the clock by the frequency of the drive.
     if drive is not None and drive.disagrees and abs(off) > SIGNIFICANT * table.drift.sd:
-        facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd, "ppm": 1e6 * off}
+        facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd, "ppm": 1e6 * drift}
         yield Finding("runs.frequency", "warn", facts, table.label)
 
 
@@ -249,14 +251,19 @@ def _contradiction(facts: Facts) -> str:
     )
 
 
+#: Largest error of a clock that is one, 1e-6: 1 %. Beyond, the frequency is another one.
+LARGEST_PPM = 1e4
+_CLOCK = (
+    "; or, where the generator is known to be right, the clock of the logger is off by {ppm:.0f} ppm, in the decays too: "
+    'state its drift, clock = {{ drift = {{ value = {ppm:.0f}, sd = ..., unit = "ppm" }} }}.'
+)
 LINT_MESSAGES = {
     "runs.frequency": Message(
         "frequency of the drive",
-        warn=(
+        warn=lambda facts: filled_in(
             "the stated Omega must be that of the current; stated {stated:g} rad/s, the current has {Omega:.6g} ± {sd:.2g} "
-            "rad/s on the clock of the record. Correct Omega; or, where the generator is known to be right, the clock of the "
-            "logger is off by {ppm:.0f} ppm, in the decays too: state its drift, clock = {{ drift = {{ value = {ppm:.0f}, sd = "
-            '..., unit = "ppm" }} }}.'
+            "rad/s on the clock of the record. Correct Omega" + (_CLOCK if abs(facts["ppm"]) < LARGEST_PPM else "."),
+            facts,
         ),
     ),
     "runs.time_scale": Message(
@@ -335,7 +342,7 @@ class RunSettings(ChannelSettings):
     Omega: Annotated[float | None, QuantityRule("rad/s")] = None
     f: Annotated[float | None, QuantityRule("Hz")] = None
     P_d: Annotated[Quantity | None, QuantityRule("N", has_sd=True)] = None
-    duty: Annotated[float | None, QuantityRule("1", SHARE)] = None
+    duty: Annotated[float | None, QuantityRule("1", PART)] = None
     P_on: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
     lag: Annotated[Quantity | None, QuantityRule("s", NOT_NEGATIVE, has_sd=True)] = None
     normal_force: Annotated[float | None, QuantityRule("N")] = None

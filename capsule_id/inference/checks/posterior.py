@@ -17,7 +17,7 @@ from capsule_id.inference.moves import geyer_size
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.prediction import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.result import PointFit, Pointwise, Posterior
-from capsule_id.inference.target import LogPosterior, prior_of
+from capsule_id.inference.target import LogPosterior, prior_of, stated_prior
 from capsule_id.parameters import SAME, Parameter, is_stated
 from capsule_id.views import Finding
 
@@ -300,7 +300,7 @@ def conflicts(s: SampledFit) -> dict[str, dict[str, float]]:
     centre, sd = _location(s)
     found = {}
     for i, row in enumerate(s.target.parameters):
-        if not (row.physical or row.scatter or is_stated(row.name) or row.name in s.rig.priors):
+        if not (row.physical or row.scatter or is_stated(row.name) or stated_prior(s.rig, row)):
             continue
         prior = s.target.priors.at(i, np)
         middle, width = float(prior.centre), float(prior.width)
@@ -315,7 +315,7 @@ def conflicts(s: SampledFit) -> dict[str, dict[str, float]]:
 
 def default_scatter(s: SampledFit, row: Parameter) -> bool:
     """Whether ``row`` is a scatter without a stated prior."""
-    return row.scatter and row.name not in s.rig.priors
+    return row.scatter and stated_prior(s.rig, row) is None
 
 
 def in_doubt(s: SampledFit) -> set[str]:
@@ -350,14 +350,15 @@ def _finding(s: SampledFit, row: Parameter, conflict: Mapping[str, float], p: fl
     name = row.name
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
     prior = prior_of(row)
-    unit = name in s.rig.priors and prior.kind == "lognormal" and wrong_prefix(conflict["value"] / prior.median)
+    stated = stated_prior(s.rig, row) is not None
+    unit = stated and prior.kind == "lognormal" and wrong_prefix(conflict["value"] / prior.median)
     facts = {
         "name": name,
         "key": "" if is_stated(name) or unit or name in in_doubt(s) else row.prior_key,
         "is_unit": unit,
         "unit": "" if row.unit == "1" else f" {row.unit}",
         "prior": prior.describe(),
-        "stated": "rig" if is_stated(name) else "prior" if name in s.rig.priors else "scatter" if row.scatter else "",
+        "stated": "rig" if is_stated(name) else "prior" if stated else "scatter" if row.scatter else "",
         "experiments": ", ".join(dict.fromkeys(e.table.label for e in readers)),
         "fitted": s.values[name],
         "p": p,
