@@ -98,6 +98,15 @@ class ParameterValue:
         return f"{self.name} = {self.quoted}, {self.trust}"
 
 
+def _warn_of_another_model(drive: Drive, fitted: float, chosen: Collection[str]) -> None:
+    """Warn of a drive that reacts otherwise than in the fit, and of fitted damping that the capsule does not have."""
+    reaction = getattr(drive, "reaction", None)
+    if reaction is not None and np.any(np.asarray(reaction) != fitted):
+        warnings.warn(f"the drive has reaction = {reaction}; that of the fit is {fitted:g}", stacklevel=3)
+    if lost := [name for name in ("F_dry", "c_q") if name in chosen]:
+        warnings.warn(f"the capsule has no {' and no '.join(lost)}: its rod is damped by c alone", stacklevel=3)
+
+
 @dataclass(frozen=True, repr=False)
 class Fit(Result):
     """A ``Result`` in words, tables, plots and files.
@@ -259,11 +268,7 @@ class Fit(Result):
         stated = {name: x for name, x in held_leaves(self.rig).items() if x is not None}
         stated |= CONSTANT if constant else {}
         values = {**stated, **self.fixed, "k2": 0.0, "G": gap, **chosen, **(given or {})}
-        reaction, fitted = getattr(drive, "reaction", None), self.rig.model.share_of_reaction
-        if reaction is not None and np.any(np.asarray(reaction) != fitted):
-            warnings.warn(f"the drive has reaction = {reaction}; that of the fit is {fitted:g}", stacklevel=2)
-        if lost := [name for name in ("F_dry", "c_q") if name in chosen]:
-            warnings.warn(f"the capsule has no {' and no '.join(lost)}: its rod is damped by c alone", stacklevel=2)
+        _warn_of_another_model(drive, self.rig.model.share_of_reaction, chosen)
         if spring is not None:
             springs = by_index("k2", chosen)
             if spring not in springs:

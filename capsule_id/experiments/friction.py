@@ -177,8 +177,12 @@ def check_scatter(tables: Sequence[Table[Any]]) -> None:
     InputError
         If readings repeat at no more settings than the law has parameters, and no reading error is stated.
     """
-    for columns in dict.fromkeys(tuple(table.columns) for table in tables):
-        alike = [table for table in tables if tuple(table.columns) == columns]
+    # Tilts have a scatter of their own, pulls and slides another one.
+    for tilted in (True, False):
+        alike = [table for table in tables if tilted == bool({"angle", "height"} & set(table.columns))]
+        columns, *others = dict.fromkeys(tuple(table.columns) for table in alike) or ((),)
+        if others or not alike:
+            continue
         rows = np.concatenate([np.stack([c.values for c in table.columns.values()], axis=1) for table in alike])
         # A law through two points, mu and v_s, leaves no scatter either; readings of one setting that differ do.
         settings = rows[:, [name in ("speed", "normal_force") for name in columns]]

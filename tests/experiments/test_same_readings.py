@@ -22,7 +22,7 @@ def test_identical_trials_need_their_reading_step(tables: tuple[Table, ...]) -> 
 
 def test_identical_pushes_need_it_too() -> None:
     columns = [bench.column("speed", [0.3, 0.3]), bench.column("distance", [0.0096, 0.0096])]
-    with pytest.raises(InputError, match="state speed_resolution"):
+    with pytest.raises(InputError, match="state distance_resolution"):
         make_experiments(bench.rig(bench.table("dynamic_friction", columns)))
 
 
