@@ -89,6 +89,8 @@ gc.disable()
 
 # The variable reaches the processes that tests start; this process has imported JAX already.
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
+# JAX has set 1, with which a command on some processors prints XLA's remarks on programs of the cache (openxla/xla 44565).
+os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
