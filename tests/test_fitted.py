@@ -228,6 +228,9 @@ def test_the_calibrated_model_as_json(capsule: Fit, tmp_path: Path) -> None:
     sloping.export(tmp_path / "slope.json", draws=5)
     # Before: level ground.
     assert json.loads((tmp_path / "slope.json").read_text(encoding="utf-8"))["fixed"]["slope"] == 0.05
+    drawn, level = (data_tree(fit)["posterior"] for fit in (sloping, wide))
+    assert np.all(drawn["slope"] == 0.05)
+    assert "slope" not in level
 
 
 def test_the_stored_sample_is_small(capsule: Fit, tmp_path: Path) -> None:

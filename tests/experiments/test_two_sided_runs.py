@@ -271,6 +271,15 @@ def test_a_contact_of_ones_own_stands_in_front_of_the_rod(tmp_path: Path) -> Non
         make_experiments(read_rig(tmp_path, contact=Hertz), contact=Hertz)
 
 
+def test_a_run_on_another_ground_is_no_point_of_a_level_diagram(tmp_path: Path) -> None:
+    write(tmp_path, harmonic(TRUTH), HARMONIC + SPRINGS.partition("spring_back")[0])
+    rig, fitted, diagram = read_rig(tmp_path), {"k2[a]": 9e3}, {**TRUTH, "P_d": 8.0, "Omega": 60.0}
+    for own, left_out in (({"slope": Quantity(0.05)}, True), ({"normal_force": 3.0}, True), ({}, False)):
+        tables = [replace(table, settings=replace(table.settings, **own)) for table in rig.tables]
+        said = overlay(replace(rig, tables=tuple(tables)), "Omega", (20.0, 90.0), diagram, fitted)[1]
+        assert ("another slope, pressing force or load" in said) == left_out
+
+
 def test_a_gap_within_four_sd_of_0_may_be_negative() -> None:
     for symbol in ("G", "G_back"):
         for value, kind in ((1.9e-4, "normal"), (2.1e-4, "positive_normal"), (-2e-4, "normal")):
