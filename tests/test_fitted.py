@@ -224,6 +224,9 @@ def test_the_calibrated_model_as_json(capsule: Fit, tmp_path: Path) -> None:
     np.testing.assert_allclose(covariance / np.outer(factors, factors), np.cov(flat.T), rtol=1e-9)
     assert saved["fixed"]["g"] == 9.81
     assert not saved["fixed"].keys() & set(names)
+    written = cast(dict[str, dict[str, object]], parameters_json(wide))
+    assert not written["fixed"].keys() & written["parameters"].keys()
+    assert written["fixed"]["reaction"] == 0.0
     sloping = dataclasses.replace(wide, rig=dataclasses.replace(capsule.rig, slope=Quantity(0.05)))
     sloping.export(tmp_path / "slope.json", draws=5)
     # Before: level ground.

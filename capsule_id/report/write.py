@@ -97,7 +97,7 @@ def parameters_json(result: Result) -> dict[str, object]:
             str(name): {column.key: _plain(column.of(row)) for column in columns}
             for name, row in result.summary.to_dict("index").items()
         },
-        "fixed": {**held_leaves(result.rig), **result.fixed},
+        "fixed": _constants(result, result.summary.index),
         "verdict": {
             "clean": result.clean,
             "findings": [
@@ -130,7 +130,7 @@ def model_json(result: Result, draws: Mapping[str, np.ndarray]) -> dict[str, obj
     names = [str(name) for name in result.summary.index if name in posterior.names]
     own = result.summary.loc[names]
     columns = np.stack([posterior.draws[..., posterior.names.index(name)].ravel() for name in names])
-    sd, held = own["sd"].to_numpy(float), {**held_leaves(result.rig), **result.fixed}
+    sd = own["sd"].to_numpy(float)
     content = {
         "format": "capsule-id model 1",
         "rig": result.rig.name,
@@ -141,11 +141,16 @@ def model_json(result: Result, draws: Mapping[str, np.ndarray]) -> dict[str, obj
             {"name": name, **{key: own.at[name, key] for key in ("unit", "value", "sd", "trust", "widening")}}
             for name in names
         ],
-        "fixed": {name: x for name, x in held.items() if x is not None and name not in names},
+        "fixed": {name: x for name, x in _constants(result, names).items() if x is not None},
         "covariance": np.atleast_2d(np.corrcoef(columns)) * np.outer(sd, sd),
         "draws": np.column_stack([draws[name] for name in names]),
     }
     return {key: _plain(value) for key, value in content.items()}
+
+
+def _constants(result: Result, sampled: Container[str]) -> dict[str, float | None]:
+    """Constants of the folder by name, SI, without those that were ``sampled``; None where its runs have several."""
+    return {name: x for name, x in {**held_leaves(result.rig), **result.fixed}.items() if name not in sampled}
 
 
 def table_frame(result: Result) -> pd.DataFrame:
@@ -374,8 +379,8 @@ def data_tree(result: Result) -> xr.DataTree:
     }
     # Exact masses stand among the draws as constants, so that whoever computes with draws has them all in one place.
     columns = dict(zip(posterior.names, np.moveaxis(_by_chain(posterior.draws), -1, 0), strict=True))
-    stated = held_leaves(result.rig)
-    held = {name: x for name in ("reaction", "slope", "N0", "lag") if (x := stated.get(name)) and name not in columns}
+    stated = _constants(result, columns)
+    held = {name: x for name in ("reaction", "slope", "N0", "lag") if (x := stated.get(name))}
     held |= result.fixed
     columns |= {name: np.full((chains, draws), value, np.float64) for name, value in held.items()}
     about_lp = {"units": "1", "meaning": "log-posterior density, unconstrained space"}
