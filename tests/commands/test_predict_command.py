@@ -1,10 +1,14 @@
 """``capsule-id predict``: wrong input ends in one line and exit code 2, and nothing is written."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 
 from capsule_id.cli import capsule_id
+from capsule_id.commands import predict as command
+from capsule_id.inference import prediction
 from tests.cli_tools import message
 
 
@@ -30,6 +34,20 @@ def test_wrong_input_is_named(
     (line,) = message(capsys.readouterr().err).splitlines()
     assert words in line
     assert out.exists() == taken
+
+
+@pytest.mark.parametrize(("trust", "code"), [("trusted", 0), ("not trusted", 3)])
+def test_failed_checks_come_before_predictions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, trust: str, code: int
+) -> None:
+    """Before: no word of them, and exit code 0."""
+    fit = SimpleNamespace(trust=trust, clean=trust == "trusted", findings=(), verdict="verdict: the words")
+    monkeypatch.setattr(command.cid, "load", lambda _: fit, raising=False)
+    monkeypatch.setattr(prediction, "predict", lambda *_, **__: SimpleNamespace(table=pd.DataFrame({"a": [1.0]})))
+    out = tmp_path / "predicted.csv"
+    assert capsule_id(["predict", str(tmp_path), "settings.csv", "--out", str(out), "--no-cache"]) == code
+    assert ("verdict: the words" in capsys.readouterr().out) == (code == 3)
+    assert out.read_text().startswith("a")
 
 
 def test_a_figure_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

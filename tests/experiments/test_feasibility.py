@@ -120,6 +120,19 @@ def test_a_drive_that_reacts_on_the_capsule_pushes_it_too() -> None:
     assert largest > 1.5 * held_rod(TRUTH, P_d, Omega, np.inf)[0]
 
 
+@pytest.mark.parametrize(
+    ("P_d", "Omega", "G", "told"),
+    [(4.6, 200.0, 3e-3, {0.0: True, 1.0: False}), (5.8, 50.0, 1e-2, {0.0: False, 1.0: True})],
+)
+def test_a_gap_out_of_reach_is_named_where_the_capsule_stays(
+    P_d: float, Omega: float, G: float, told: dict[float, bool]
+) -> None:
+    """Above resonance a drive that reacts on the capsule pushes it more than spring and damper do, below it less."""
+    for reaction, expected in told.items():
+        found = feasibility(run_table(P_d, Omega, G), {**TRUTH, "k2": 56410.0, "reaction": reaction}, F_B)
+        assert ("runs.contact" in {finding.code for finding in found}) == expected
+
+
 def test_a_drive_of_hours_is_judged_by_its_start() -> None:
     """Against a step of the same load: overshoot exp(-pi zeta/sqrt(1 - zeta^2)) beyond P_d/k1, no spring in reach."""
     largest, touches = held_rod({**TRUTH, "k2": 18960.0, "c": 0.5}, P_d=1.0, Omega=1e-3, G=1.0)

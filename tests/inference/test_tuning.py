@@ -208,6 +208,17 @@ def test_operating_points_are_those_of_the_fitted_rig(tmp_path: Path) -> None:
         )
         found = {name: settings for name, settings, _ in points}
         np.testing.assert_allclose(found.get(label, points[0][1])["slope"], expected)
+    drawn = {
+        "P_on": np.full(2, 3.0),
+        "lag": np.full(2, 0.006),
+        "k2[medium]": chosen["k2[medium]"],
+        "G": np.full(2, 9.0),
+    }
+    for sd, expected in ((0.0, (6.0, 0.002)), (1e-4, (3.0, 0.006))):
+        own = {"drive": "pulses", "duty": 0.4, "P_on": Quantity(6.0, sd), "lag": Quantity(0.002, sd), "P_d": None}
+        tables = [replace(t, settings=replace(t.settings, **own)) for t in rig.tables if t.label == "run_1"]
+        ((_, settings, _),) = operating_points(fit_of(TRUTH, rig=replace(rig, tables=tuple(tables))), drawn, "pulses")
+        np.testing.assert_allclose([np.mean(settings["P_on"]), np.mean(settings["lag"])], expected)
     known = _fitted(fit_of(TRUTH, rig=rig), chosen)
     assert (known["slope"], known["reaction"]) == (0.05, 0.0)
     assert known["m2"] is chosen["m2"]
