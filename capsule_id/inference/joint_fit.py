@@ -17,7 +17,7 @@ from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.inference.curvature import covariance
 from capsule_id.inference.least_squares import KINKED, LeastSquaresFit, Solver, least_squares, linearised
 from capsule_id.inference.marginal import density_of, rows_of
-from capsule_id.inference.point_fit import AGREEMENT, described, dispersed_starts
+from capsule_id.inference.point_fit import NEGLIGIBLE_INCREASE, at_another_maximum, described, dispersed_starts
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.views import counted
@@ -134,10 +134,6 @@ ROUNDS_WITH_KINKS = 3
 MOVES_IN_SD, LEAST_INCREASE, MAX_RESTARTS = 2.0 ** np.arange(8), 1.0, 4
 #: Largest such step of a positive parameter, natural logarithm.
 FARTHEST = 2.0
-#: Differences in log-posterior below this count as equal. A contact that crosses a sample gives the likelihood a kink.
-#: Kinks produce local maxima less than a standard deviation apart, which count as one. The gradient does not vanish
-#: at a kink, so a descent ends where the predicted Gauss–Newton increase is below this.
-NEGLIGIBLE_INCREASE = 0.1
 #: Stop refining a start whose cost exceeds this many times the best.
 COST_RATIO_TO_ABANDON = 3.0
 #: Searches that run side by side; their number does not depend on the cores, nor do the results.
@@ -197,7 +193,7 @@ def joint_fit(
         starts=starts[: len(ends)],
         ends=u,
         log_posterior=value,
-        at_other_maximum=_at_another_maximum(u, value, np.sqrt(np.diag(matrix))),
+        at_other_maximum=at_another_maximum(u, value, np.sqrt(np.diag(matrix))),
         stalled=np.array([not end.converged for end in ends]),
     )
 
@@ -236,14 +232,6 @@ def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
             limit = COST_RATIO_TO_ABANDON * float(best.fit.cost[0])
             ends += workers.map(partial(_search, target, limit=limit), own)
     return ends
-
-
-def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """(s,) whether each end u (s, d) differs from the best maximum; log-posterior (s,), posterior sd (d,)."""
-    best = int(np.argmax(value))
-    away = np.max(np.abs(u - u[best]) / spread, axis=1)
-    dent = (away < 1.0) & (value > value[best] - NEGLIGIBLE_INCREASE)
-    return ~((away <= AGREEMENT) | dent) | ~np.isfinite(value)
 
 
 def _suffice(target: LogPosterior, ends: list[_End], highest: float) -> bool:
@@ -330,7 +318,7 @@ def _rescaled(target: LogPosterior, u: np.ndarray) -> np.ndarray:
 
 
 def _is_converged(fit: LeastSquaresFit) -> bool:
-    """Whether a fit from one start converged, or stopped where no step increases the log-posterior."""
+    """Whether a fit from one start converged, or stopped where no step increases the log-posterior, as at a kink."""
     step = np.linalg.lstsq(fit.jacobian[0], -fit.residuals[0])[0]
     return not fit.stalled[0] or bool(0.5 * np.sum((fit.jacobian[0] @ step) ** 2) < NEGLIGIBLE_INCREASE)
 

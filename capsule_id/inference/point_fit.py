@@ -70,6 +70,9 @@ def variance_shares(
 STARTS = 5
 #: Ends that differ by less than this many posterior standard deviations count as the same maximum.
 AGREEMENT = 0.05
+#: Differences in log-posterior below this count as equal. A contact that crosses a sample gives the likelihood a kink.
+#: Kinks, and rounding, produce local maxima less than a standard deviation apart, which count as one.
+NEGLIGIBLE_INCREASE = 0.1
 #: Smallest curvature that counts, relative to Gauss-Newton's.
 FLATTEST = 1e-4
 #: An end of least squares this near to a maximum, in posterior standard deviations, belongs to it.
@@ -114,6 +117,14 @@ def _highest(value: np.ndarray) -> int:
     return int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
 
 
+def at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(s,) whether each end u (s, d) differs from the best maximum; log-posterior (s,), posterior sd (d,)."""
+    best = _highest(value)
+    away = np.max(np.abs(u - u[best]) / spread, axis=1)
+    same = (away <= AGREEMENT) | ((away < 1.0) & (value > value[best] - NEGLIGIBLE_INCREASE))
+    return ~same | ~np.isfinite(value)
+
+
 def _from_maxima(
     target: LogPosterior, starts: np.ndarray, u: np.ndarray, value: np.ndarray, converged: np.ndarray
 ) -> PointFit:
@@ -131,7 +142,7 @@ def _from_maxima(
         starts=starts,
         ends=u,
         log_posterior=value,
-        at_other_maximum=~np.all(np.abs(u - u[best]) < AGREEMENT * spread, axis=1),
+        at_other_maximum=at_another_maximum(u, value, spread),
         stalled=~converged | ~np.isfinite(value),
     )
 

@@ -26,7 +26,6 @@ from capsule_id.inference.checks.posterior import check_starts
 from capsule_id.inference.joint_fit import (
     LEAST_INCREASE,
     STARTS,
-    _at_another_maximum,
     _better_point,
     _descend,
     _is_converged,
@@ -38,6 +37,7 @@ from capsule_id.inference.joint_fit import (
 )
 from capsule_id.inference.least_squares import Solver, linearised, rows_of
 from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.point_fit import at_another_maximum
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.sampling import laplace_proposal
@@ -148,7 +148,7 @@ def test_ends_are_one_maximum_where_the_posterior_cannot_tell() -> None:
     """The best, one beside it, a dent, a point on its slope, and one as high, but two sd away."""
     u = np.array([[0.0, 0.0], [0.04, 0.0], [0.5, 0.0], [0.5, 0.0], [2.0, 0.0]])
     value = np.array([10.0, 9.9, 9.95, 9.8, 9.99])
-    assert _at_another_maximum(u, value, np.ones(2)).tolist() == [False, False, False, True, True]
+    assert at_another_maximum(u, value, np.ones(2)).tolist() == [False, False, False, True, True]
 
 
 @pytest.mark.full
