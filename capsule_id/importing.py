@@ -337,7 +337,7 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
         (sheet, None) for sheet in sheets_of(content, path) or (None,)
     ]
     blocks: tuple[tuple[int, int], ...] = ()
-    for sheet, block in parts:  # it grows by the further blocks of a text
+    for number, (sheet, block) in enumerate(parts, 1):  # it grows by the further blocks of a text
         try:
             found = find_layout(content, path, dimensions_of(kinds), sheet, block)
         except InputError as error:
@@ -348,7 +348,7 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
             blocks = found.blocks or blocks
             found = replace(found, blocks=blocks)
             guesses.append(guess(found, kinds))
-            entries.append(_entry(found, guesses[-1], content, kinds))
+            entries.append(_entry(found, guesses[-1], content, kinds, number))
             long = [one for one in found.blocks if one[1] - one[0] >= FEWEST_SAMPLES]
             parts += [(sheet, one) for one in long if block is None and one[0] != found.layout.data_from_line]
     if not guesses:
@@ -359,8 +359,8 @@ def entry_of(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> tuple[str
     return "\n".join(entries), guesses[0]
 
 
-def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Mapping[str, Kind]) -> str:
-    """The lines of ``[[experiment]]`` for an export with its guess."""
+def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Mapping[str, Kind], number: int) -> str:
+    """The lines of ``[[experiment]]`` for an export with its guess, the ``number``-th entry of its file."""
     unread, file = list(_unread_lines(found, dimensions_of(kinds))), found.export.path.name
     if guessed is None:
         headers = ", ".join(name for name in found.names if name) or "none"
@@ -379,8 +379,8 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
             f"#: Write one of {' '.join(kinds)}, and the columns of that kind.",
             "# [[experiment]]",
             '# kind = "..."',
-            f"# file = {json.dumps(file)}",
-            *(f"# {line}" for line in _layout_lines(found)),
+            f"# file = {json.dumps(file, ensure_ascii=False)}",
+            *(f"# {line}" for line in _layout_lines(found, number)),
             '# columns = { ... = { from = 1, unit = "..." } }',
         ]
         return "\n".join(lines) + "\n"
@@ -393,8 +393,8 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
         *_unused_lines(found, guessed, kind),
         "[[experiment]]",
         _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason),
-        _commented(f"file = {json.dumps(file)}", "sure", _description(found, content)),
-        *_layout_lines(found),
+        _commented(f"file = {json.dumps(file, ensure_ascii=False)}", "sure", _description(found, content)),
+        *_layout_lines(found, number),
         *labels,
         *_setting_lines(found, guessed, kind),
         *_column_lines(found, guessed, kind),
@@ -443,11 +443,12 @@ def _description(found: FoundLayout, content: bytes) -> str:
     return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
 
 
-def _layout_lines(found: FoundLayout) -> Iterable[str]:
+def _layout_lines(found: FoundLayout, number: int) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
     used, blocks = found.layout, ", ".join(f"{first} to {last}" for first, last in found.blocks)
     part = used.sheet or (used.data_from_line if len(found.blocks) > 1 else None)
     stem = found.export.path.stem if used.sheet else found.export.path.name
+    part = number if used.sheet and not used.sheet.isascii() else part  # names in other letters would be equal
     label = re.sub(r"[^A-Za-z0-9._-]+", "_", f"{stem}_{part}") if part else None
     codes = [text for text in used.missing if text not in NO_READING]
     several, one = len(found.blocks) > 1, f"the end of one of {len(found.blocks)} blocks of readings, lines {blocks}"

@@ -190,7 +190,7 @@ def run(args: argparse.Namespace) -> int:
         usable = re.fullmatch(NAME_PATTERN, name) and name.strip(".")
         text = template(kinds, name if usable else "rig", [entry for entry, _ in guesses.values()])
         for m, line in masses.items():
-            text = re.sub(rf"^# {m} = .*", line, text, count=1, flags=re.MULTILINE)
+            text = re.sub(rf"^# {m} = .*", lambda _, line=line: line, text, count=1, flags=re.MULTILINE)
         schema = json.dumps(rig_schema(kinds), separators=(",", ":")) + "\n"
         contents = {"rig.toml": text.encode(), "rig.schema.json": schema, **contents}
         # A part of a table would be read as a table.

@@ -29,7 +29,7 @@ from capsule_id.rig.formats.raw import (
     TextFile,
     lines_of,
 )
-from capsule_id.rig.formats.text import is_row, is_stamp, seconds_of_stamps
+from capsule_id.rig.formats.text import is_row, is_stamp, number_in, seconds_of_stamps
 from capsule_id.rig.schema import KindRule
 from capsule_id.rig.times import evened
 from capsule_id.rig.toml import LARGEST, shown
@@ -138,8 +138,9 @@ def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | No
         return f"{found[1]} {found[4]}", text.strip()
     for mark in ("_", "/"):
         for place in re.finditer(mark, header):
-            if unit_of(header[place.end() :], dimensions) is not None:
-                return header[: place.start()], header[place.end() :]
+            above, _, below = (unit := header[place.end() :]).partition("/")
+            if above != below and unit_of(unit, dimensions) is not None:  # F_N/N is F_N in N
+                return header[: place.start()], unit
     return header, None
 
 
@@ -206,7 +207,11 @@ Cells = tuple[str | None, int] | None
 Run = tuple[Cells, int, int, int]
 #: Columns of readings and of single numbers, and the errors of all others, by index.
 Readings = tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]
-_RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
+#: A number of samples a second, and words of the lines that state one.
+_RATE = re.compile(r"([0-9][0-9.,'\u2019 \u00a0\u202f]*(?:e[+-]?[0-9]+)?)\s*(k?)(?:Hz|S/s)\b", re.IGNORECASE)
+_SAMPLING = re.compile(
+    r"sampl|rate\b|abtast|messfreq|acqui|[eé]chantillon|muestreo|campion|S/s|\bf_?s\b", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -304,7 +309,7 @@ def find_layout(
     texts = {index: [row[index] for row in export.cells()] for index in unread} if export.cells else {}
     stamps = {index: values for index in texts if (values := _stamps(texts[index], export, layout, index)) is not None}
     read_too = {index: error for index, error in unread.items() if index not in stamps}
-    rate, every = _rate(beginning, names, singles), {**columns, **stamps}
+    rate, every = _rate(beginning, names, units, singles), {**columns, **stamps}
     labelled = [index for index in texts if any(fits_name(names[index], word) > 0 for word in LABELS)]
     labels = {index: tuple(sorted({*texts[index]})) for index in labelled}
     return FoundLayout(export, layout, names, units, every, read_too, rate, frozenset(stamps), blocks, labels)
@@ -445,17 +450,23 @@ def _headers(export: Export, dimensions: Sequence[str]) -> tuple[tuple[str, ...]
     return names or empty, tuple(cell.strip(" []()") for cell in units) if units is not None else empty
 
 
-def _rate(beginning: bytes, names: Sequence[str], singles: dict[int, float]) -> float | None:
-    """The sampling rate stated in the titles of a text, or by a number with the name of a rate, Hz."""
+def _rate(beginning: bytes, names: Sequence[str], units: Sequence[str], singles: dict[int, float]) -> float | None:
+    """The sampling rate that the titles of a text state, or a number with the name of a rate, Hz; None where they differ."""
+    rates = set[float | None]()
     for column, value in singles.items():
         name = re.split(r"[./]", names[column].lower())[-1]  # a field of a struct, an attribute of a group
-        if name in (*RATE_NAMES, *STEP_NAMES) and value > 0.0:
-            return value if name in RATE_NAMES else 1.0 / value
-    for line in beginning.decode("utf-8", "replace").splitlines()[:_MOST_TITLES]:
-        found = _RATE.search(line)
-        if found:
-            return float(found[1].replace(",", ".")) * (1e3 if found[2].lower().startswith("k") else 1.0)
-    return None
+        for known, si in ((RATE_NAMES, "Hz"), (STEP_NAMES, "s")):
+            if name in known and value > 0.0:
+                unit = unit_of(units[column] or si, [si])
+                size = value * factor_to_si(unit, si) if unit else None
+                rates.add(size if si == "Hz" or size is None else 1.0 / size)
+    for line in beginning.decode("utf-8", "replace").splitlines()[:_MOST_TITLES] if not rates else ():
+        for found in _RATE.finditer(line) if _SAMPLING.search(line) else ():
+            # 10,000 Hz may be 10 Hz.
+            number = next((x for mark in ".," if (x := number_in(found[1].strip(), mark)) is not None), None)
+            unsure = re.fullmatch("[1-9][0-9]{0,2}[.,][0-9]{3}", found[1].strip())
+            rates.add(None if number is None or unsure else number * (1e3 if found[2] else 1.0))
+    return rates.pop() if len(rates) == 1 else None
 
 
 # rows: Finds what stands among readings and is none: rows of statistics, and values that stand for a missing reading.

@@ -5,10 +5,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
+from capsule_id.errors import InputError
 from capsule_id.parameters import SAME
 from capsule_id.rig.formats.raw import NO_READING, Export, Layout, Place, RawTable
 from capsule_id.rig.formats.text import seconds_of_stamps
@@ -428,9 +430,13 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
         with np.errstate(over="ignore"):
             values[name] = np.concatenate(own) * source.scale + source.offset
     where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
+    if idle := [each.path.name for part in parts for each in part.exports if each.path not in part.used]:
+        rule = "files with different headers are put side by side, and each must hold a column that is mapped"
+        raise entry["files"].error(rule, idle[0], "give all files the same headers, or make an experiment of each")
     keep, missing = _kept(node, values, where)
     for name, source in column_map.sources.items():
         if (rate := source.rate) is not None:
+            _refuse_gaps(node[name]["rate"], exports, parts)
             values[name] = np.arange(first_rows[-1]) / rate
 
     # Arrays of a file may have other lengths than those that the map names.
@@ -440,6 +446,19 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
     other = int(np.sum(~keep & ~missing))
     raw = raw if keep.all() else replace(raw.taken(np.flatnonzero(keep)), lost=rows[missing], other=other)
     return [("", raw)] if column_map.layout.split_by is None else _by_texts(entry["split_by"], parts, raw, keep)
+
+
+def _refuse_gaps(node: Node, exports: Sequence[Export], parts: Sequence["_Part"]) -> None:
+    """Refuse a stated rate where the rows do not show which sample is which."""
+    if len(parts) > 1:
+        raise node.error("a rate gives the times of one file", f"{len(parts)} files", "make an experiment of each")
+    for export in exports:
+        gaps = np.flatnonzero(np.diff(export.lines) > 1)
+        if gaps.size:
+            line = int(export.lines[gaps[0]]) + 1
+            rule = "a rate gives the times of rows that follow one another"
+            remedy = "write NaN there if a reading is lost, or delete the line; or export times"
+            raise InputError(rule, f"line {line} is no row", remedy, export.path, line, 1)
 
 
 def _by_texts(split_by: Node, parts: Sequence["_Part"], raw: RawTable, keep: np.ndarray) -> list[tuple[str, RawTable]]:
@@ -458,6 +477,7 @@ class _Part:
 
     def __init__(self, exports: Sequence[Export]) -> None:
         self.exports, self.rows = exports, 0  # the number of rows of the columns found
+        self.used = set[Path]()
 
     def find(self, node: Node, header: Header, texts: bool = False) -> Found:
         """The column ``header``, stated at ``node`` of ``rig.toml``: its numbers, or its ``texts``."""
@@ -470,6 +490,7 @@ class _Part:
                 remedy_for(str(header), known, "write the number of the column, counted from 1"),
             )
         found = list[np.ndarray]()
+        self.used |= {export.path for export, _ in named}
         for export, index in named:
             if not texts:
                 found.append(export.values(index))
@@ -497,7 +518,7 @@ class _Part:
                 raise node.error(
                     f"{shown(header)} must be the same in {named[0][0].path.name} and {export.path.name}",
                     f"{shown(one)} and {shown(other)}",
-                    "name files that were recorded together",
+                    "name files that were recorded together, or make an experiment of each",
                 )
         (first, column), values = named[0], found[0]
         place = first.place  # the numbers of the file are not kept beside the table

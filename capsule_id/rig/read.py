@@ -243,15 +243,17 @@ def _read_experiments(
 
 
 def _default_labels(entries: Sequence[Any]) -> list[str]:
-    """The name of the first file of each entry, with its folders where several folders have a file of that name."""
+    """The name of the first file of each entry, with what tells it from those of others: its folders, its suffix."""
     paths = []
     for entry in entries:
         stated = {} if not isinstance(entry, dict) or "label" in entry else entry
         files = stated.get("files")
         name = files[0] if isinstance(files, list) and files else stated.get("file")
         paths.append(Path(os.path.normpath(name)) if isinstance(name, str) else Path())
-    folders = {path.stem: {other.parent for other in paths if other.stem == path.stem} for path in paths}
-    return ["_".join((*path.parent.parts, path.stem)) if len(folders[path.stem]) > 1 else path.stem for path in paths]
+    alike = {path: {other for other in paths if other.stem == path.stem} for path in paths}
+    folders = [path.parent.parts if len({other.parent for other in alike[path]}) > 1 else () for path in paths]
+    names = [path.name if sum(o.parent == path.parent for o in alike[path]) > 1 else path.stem for path in paths]
+    return ["_".join((*folder, name)) for folder, name in zip(folders, names, strict=True)]
 
 
 def _read_experiment(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import openpyxl
 import pyarrow as pa
 import pytest
 from nptdms import ChannelObject, TdmsWriter
@@ -89,6 +90,59 @@ def test_a_rate_or_a_step_of_matlab(tmp_path: Path, name: str, value: float, str
     entry = entry_of(tmp_path, "a.mat", content.getvalue())
     assert 'time = { rate = { value = 1000, unit = "Hz" } }  # likely' in entry
     assert 'unit = "?"' in entry  # of the displacement, which MATLAB does not state
+
+
+@pytest.mark.parametrize(
+    ("titles", "rate"),
+    [
+        ("Sampling rate: 1.0E+3 Hz", "1000"),
+        ("Sampling rate: 10 000 Hz", "10000"),
+        ("Sampling rate: 10,000 Hz", '"?"'),
+        ("Low-pass filter: 200 Hz\nAbtastrate: 1000,0 Hz", "1000"),
+        ("Mains filter 50 Hz", '"?"'),
+        ("Sampling rate: 1 kHz\nSampling rate of channel 2: 500 Hz", '"?"'),
+    ],
+)
+def test_a_rate_of_titles(tmp_path: Path, titles: str, rate: str) -> None:
+    """Before: the first frequency of the titles, whatever it was of, with the comma as decimal mark."""
+    text = f"{titles}\nx (mm)\n" + "".join(f"{x:.5f}\n" for x in DISP)
+    assert f"rate = {{ value = {rate}, " in entry_of(tmp_path, "a.csv", text.encode())
+
+
+@pytest.mark.parametrize(("name", "unit", "value"), [("dt", "ms", [1.0]), ("fs", "kHz", [1.0]), ("fs", "", 1000.0)])
+def test_units_and_scalars_of_a_stored_rate(tmp_path: Path, name: str, unit: str, value: object) -> None:
+    """Before: a unit was not read, and a scalar not seen."""
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file["x"], file[name] = DISP, value
+        file[name].attrs["unit"] = unit
+    assert "rate = { value = 1000, " in entry_of(tmp_path, "a.h5", content.getvalue())
+    np.savez(tmp_path / "a.npz", x=DISP, fs=1000.0)
+    assert "rate = { value = 1000, " in propose_entry(tmp_path / "a.npz")
+
+
+def test_a_symbol_over_its_unit(tmp_path: Path) -> None:
+    """DIN and ISO 80000 write F_N/N for F_N in N. Before: F in N/N."""
+    text = "v [mm/s];F_k/N;F_N/N\n" + "".join(f"{10 + k};{0.4 + 0.01 * k:.2f};{1 + 0.02 * k:.2f}\n" for k in range(12))
+    entry = entry_of(tmp_path, "a.csv", text.encode())
+    assert 'columns.normal_force = { from = "F_N/N", unit = "N" }' in entry
+    assert 'columns.speed = { from = "v [mm/s]", unit = "mm/s" }' in entry
+
+
+def test_sheets_named_in_other_letters_and_cells_of_per_cent(tmp_path: Path) -> None:
+    """Before: two entries of one label, and 20 % read as 0.2 %."""
+    book = openpyxl.Workbook()
+    for sheet in (book.active, book.create_sheet("Жёсткая")):
+        sheet.append(["duty [%]", "F [N]"])
+        for k in range(2, 9):
+            sheet.append([k / 10, 2.0 * k])
+            sheet.cell(k, 1).number_format = "0%"
+    book.worksheets[0].title = "Мягкая"
+    book.save(tmp_path / "a.xlsx")
+    entry = propose_entry(tmp_path / "a.xlsx")
+    assert 'label = "a_1"' in entry
+    assert 'label = "a_2"' in entry
+    assert "'duty [%]' is not read: line 2 has '20%'" in entry
 
 
 def test_columns_that_are_not_used_are_named(tmp_path: Path) -> None:

@@ -172,6 +172,56 @@ def test_a_missing_reading_keeps_the_times_of_a_stated_rate(tmp_path: Path) -> N
     np.testing.assert_allclose(table["time"], np.delete(TIME, 3), rtol=1e-14)
 
 
+RATE_MAP = 'columns = { time = { rate = { value = 100, unit = "Hz" } }, x_rel = { from = "x", unit = "mm" } }'
+
+
+def test_a_rate_does_not_close_up_a_lost_row(tmp_path: Path) -> None:
+    """Before: every sample behind a blank line was moved, without a word."""
+    text = "x\n" + "".join("\n" if i == 3 else f"{x!r}\n" for i, x in enumerate(DISP.tolist()))
+    fault = fault_of(tmp_path, {"t.csv": text}, f'file = "t.csv"\n{RATE_MAP}')
+    assert (fault.file, fault.line) == (str(tmp_path / "t.csv"), 5)
+    mended = text.replace("\n\n", "\nNaN\n")
+    (table,) = rig_of(tmp_path, {"t.csv": mended}, f'file = "t.csv"\n{RATE_MAP}').tables
+    np.testing.assert_allclose(table["time"], np.delete(TIME, 3), rtol=1e-14)
+
+
+def test_a_rate_does_not_join_files(tmp_path: Path) -> None:
+    """Before: two runs were one continuous record."""
+    files: dict[str, str | bytes] = dict.fromkeys(
+        ("a.csv", "b.csv"), "x\n" + "".join(f"{x!r}\n" for x in DISP.tolist())
+    )
+    fault = fault_of(tmp_path, files, f'files = ["a.csv", "b.csv"]\n{RATE_MAP}')
+    assert "a rate gives the times of one file" in fault.rule
+
+
+def test_a_file_of_which_no_column_is_mapped_is_refused(tmp_path: Path) -> None:
+    """Before: a second file whose header differed in one letter was dropped without a word."""
+    files: dict[str, str | bytes] = {"a.csv": LAB, "b.csv": LAB.replace("Disp", "disp")}
+    files["b.csv"] = str(files["b.csv"]).replace("Time", "time")
+    fault = fault_of(tmp_path, files, f'files = ["a.csv", "b.csv"]\n{MAP}')
+    assert fault.value == "b.csv"
+    assert "side by side" in fault.rule
+
+
+@pytest.mark.parametrize("cell", ["20%", "\u22120.5"])
+def test_signs_of_per_cent_and_of_minus(tmp_path: Path, cell: str) -> None:
+    """Before: the remedy for both was to drop the row."""
+    text = LAB + f"0.5,{cell}\n"
+    if "%" in cell:
+        fault = fault_of(tmp_path, {"t.csv": text}, f'file = "t.csv"\n{MAP}')
+        assert "remove the signs of per cent" in fault.remedy
+        return
+    (table,) = rig_of(tmp_path, {"t.csv": text}, f'file = "t.csv"\n{MAP}').tables
+    assert table["x_rel"][-1] == -0.5e-3
+
+
+def test_names_of_files_with_one_stem(tmp_path: Path) -> None:
+    """Before: what ``init --from run.csv run.txt`` wrote was refused."""
+    files: dict[str, str | bytes] = {"run.csv": LAB, "run.txt": LAB.replace("3.0", "3.1")}
+    rig = rig_of(tmp_path, files, *(f'file = "{name}"\n{MAP}' for name in files))
+    assert [table.label for table in rig.tables] == ["run.csv", "run.txt"]
+
+
 def test_where_selects_rows_by_header_or_number(tmp_path: Path) -> None:
     both = [(30, DISP), (40, 2.0 * DISP)]
     text = "tau,t,x\n" + "".join(rows(",", columns=(np.full(12, tau), TIME, x)) for tau, x in both)

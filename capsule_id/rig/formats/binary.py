@@ -181,7 +181,7 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
             # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
             if (
                 not isinstance(found, h5py.Dataset)
-                or not (found.size and found.ndim in (1, 2) and found.dtype.kind in "fiu")
+                or not (found.size and found.ndim <= 2 and found.dtype.kind in "fiu")
                 or found.attrs.get("MATLAB_class") in (b"char", "char")
                 or name.startswith("#")
                 or "MATLAB_empty" in found.attrs
@@ -189,7 +189,7 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
                 continue
             readings += found.size
             refuse_large(READING * readings, content, path)
-            array, unit = _unpacked(_written(found), found.attrs), unit_stated(found.attrs)
+            array, unit = _unpacked(np.atleast_1d(_written(found)), found.attrs), unit_stated(found.attrs)
             yield name, np.ascontiguousarray(array.T if by_columns else array), unit
         objects: Any = [("", file), *((k, file[k]) for k, link in links.items() if isinstance(link, h5py.HardLink))]
         for name, found in objects:
@@ -325,12 +325,12 @@ def _numbers(content: bytes) -> np.ndarray | None:
     version = np.lib.format.read_magic(stream)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read_header(stream)
-    if dtype.kind not in "fiu" or len(shape) not in (1, 2):
+    if dtype.kind not in "fiu" or len(shape) > 2:
         return None
     if prod(shape) * dtype.itemsize != len(content) - stream.tell():
         raise ValueError(f"an array of {shape} in {len(content)} bytes")
     stream.seek(0)
-    return np.lib.format.read_array(stream, allow_pickle=False)
+    return np.atleast_1d(np.lib.format.read_array(stream, allow_pickle=False))
 
 
 read_npz = partial(_read_arrays, _members, "write it again by numpy.savez", "")
@@ -533,15 +533,22 @@ def _rows(sheet: Any, path: Path) -> tuple[list[list[str]], bool]:
     if not hasattr(sheet, "reset_dimensions"):  # a sheet that holds only a chart
         return rows, numbers
     sheet.reset_dimensions()  # the stated size of a sheet can be far larger than the sheet
-    for row in sheet.iter_rows(values_only=True):
+    for row in sheet.iter_rows():
         cells += len(row) or BLANK_ROW  # the stated number of a row can lie far below the last one
         if cells > MOST_CELLS:
             raise _too_many(path)
-        real = [*map(is_number, row)]
+        real = [is_number(cell.value) for cell in row]
         numbers = numbers or any(real)
         texts = zip(row, real, strict=True)
-        rows.append([repr(float(c)) if n else "" if c is None else " ".join(str(c).split()) for c, n in texts])
+        rows.append(
+            [_written_number(c) if n else "" if c.value is None else " ".join(str(c.value).split()) for c, n in texts]
+        )
     return rows, numbers
+
+
+def _written_number(cell: Any) -> str:
+    """The number of a cell as text, as the sheet shows it where that is per cent: 0.2 as 20%."""
+    return f"{100.0 * cell.value:.15g}%" if "%" in cell.number_format else repr(float(cell.value))
 
 
 def _in_sheet(error: InputError, lines: list[str], more: str = "") -> InputError:

@@ -248,8 +248,8 @@ def is_number(cell: str) -> bool:
 
 
 def _is_reading(cell: str, layout: Layout) -> bool:
-    """Whether a cell is a number, a time stamp, or a stated missing marker."""
-    return is_number(cell) or cell in layout.missing or is_stamp(cell)
+    """Whether a cell is a number, with a sign of per cent or not, a time stamp, or a stated missing marker."""
+    return is_number(cell.removesuffix("%")) or cell in layout.missing or is_stamp(cell)
 
 
 # csv: Reads CSV tables: a header ``name [unit]`` per column, then rows of numbers as any text export has them.
@@ -398,14 +398,14 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
     InputError
         If the headers are incomplete, or segments have different channels.
     """
-    refuse_line(layout, path)
+    refuse_line(replace(layout, decimal=None), path)
     text = TextFile(content, path)
     separator, head, segments = _take_apart(text)
     names, (stated, computed) = (
         segments[0].names,
         ([*head.get(key, []), ""][0] for key in ("Decimal_Separator", "X_Columns")),
     )
-    decimal = stated if stated in (".", ",") else None
+    decimal = stated if stated in (".", ",") else layout.decimal
     sources, clocks = list(range(len(names))), dict[int, list[tuple[float, float]]]()
     if computed.lower() == "no":  # -k: the computed times of channel k
         clocks = {-k: [_clock(segment, k, decimal, path) for segment in segments] for k in sources[1:]}

@@ -82,6 +82,7 @@ def number_in(cell: str, decimal: str, apart: bool = False) -> float | None:
 
     Its thousands may be separated; by a point or a comma alone only where it is known that they are ``apart``: 1,234.
     """
+    cell = cell.replace("\u2212", "-")  # a typographic minus
     if (found := _GROUPED.fullmatch(cell)) and (mark := found["mark"]) != decimal:
         sure = apart or mark not in ".," or decimal in cell or cell.count(mark) > 1
         cell = cell.replace(mark, "") if sure else cell
@@ -98,6 +99,11 @@ def no_number(cell: str, value: float | None, place: Place) -> InputError:
             value is not None or cell.lower().lstrip("+-") in ("inf", "infinity"),
             "finite number",
             "write a smaller number: float64 ends at 1.8e308",
+        ),
+        (
+            cell.endswith("%"),
+            "number alone",
+            "remove the signs of per cent (in a sheet: give the cells no such format)",
         ),
         (True, "number", f"correct the cell, or add {text} to missing = [...] to drop its row"),
     )
