@@ -162,8 +162,9 @@ MESSAGES = {
         fail=(
             "{tilts} and {slides}: expected one surface; found mu = {mu_tilts:.3f} at rest and {mu_slides:.3f} by "
             "sliding ({p:p}). Measure both on the same surface, and read the tilt or pull at break-away. Static friction "
-            "above sliding friction is no fault, but constant friction cannot show it: give the slides a column speed and "
-            'state friction = "stribeck", or fit both in folders of their own.'
+            "above sliding friction is no fault of the rig: slides with a column speed show it under eq. (1), with "
+            'free = ["ratio"] in [model] also where they are slow; constant friction cannot. Else fit both in folders of their '
+            "own."
         ),
     ),
 }

@@ -249,14 +249,26 @@ def other_laws(friction: FrictionModel) -> tuple[str, ...]:
     return (*constant, *ratio)
 
 
-def model_lines(model: FrictionModel) -> str:
-    """What ``[model]`` must say for the law ``model``."""
+#: Of a rig without ``[model]``.
+DEFAULT_CHOICES = ModelChoices()
+
+
+def model_lines(model: FrictionModel, stated: ModelChoices = DEFAULT_CHOICES) -> str:
+    """What ``[model]`` must say for the law ``model`` where ``stated`` is what it says now; other free symbols are kept."""
+    kept = (symbol for symbol in stated.free if symbol not in OF_FRICTION)
+    free = ", ".join(f'"{symbol}"' for symbol in (*model.free, *kept))
     lines = ['friction = "constant"'] if model.constant else []
-    if model.free:
-        lines.append("free = [" + ", ".join(f'"{symbol}"' for symbol in model.free) + "]")
-    return ", and on the next line ".join(lines) or 'friction = "stribeck"'
+    if not model.constant and (stated.friction != DEFAULT_CHOICES.friction or not (free or stated.free)):
+        lines = ['friction = "stribeck"']
+    lines += [f"free = [{free}]"] * bool(free or stated.free)
+    replaced = " (in place of the lines that begin so)" * bool(
+        stated.free or stated.friction != DEFAULT_CHOICES.friction
+    )
+    return ", and on the next line ".join(lines) + replaced
 
 
+#: Symbols of the friction law of the paper, those that may be free included.
+OF_FRICTION = frozenset(row.symbol for row in CoulombStribeck.parameters)
 #: Default friction law: eq. (1) of the paper.
 EQUATION_1 = FrictionModel()
 
@@ -269,8 +281,7 @@ def friction_of(rig: Rig, law: type[FrictionLaw] | None = None, contact: type[Fo
     InputError
         If both ``law`` and ``[model]`` choose the friction, or ``law`` cannot be fitted.
     """
-    own = {row.symbol for row in CoulombStribeck.parameters}
-    free = tuple(symbol for symbol in rig.model.free if symbol in own)
+    free = tuple(symbol for symbol in rig.model.free if symbol in OF_FRICTION)
     if law is None:
         return FrictionModel(free=free, constant=rig.model.friction == "constant", contact=contact)
     if free or rig.model.friction != ModelChoices().friction:

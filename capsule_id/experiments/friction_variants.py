@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.experiments.statistics import of_neighbours, permutation_p
 from capsule_id.parameters import QUANTILE_975, SAME, Parameter, Prior
 from capsule_id.physics.forces import CoulombStribeck
+from capsule_id.rig.model import ModelChoices, Quantity
 from capsule_id.views import Finding, Level, after_number
 
 # friction variants: Variants of the friction law, compared by their marginal likelihoods on the friction experiments.
@@ -228,7 +230,9 @@ def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:
 FEWEST_SLIDES, SEED = 3, 0
 
 
-def _doubt(variants: Sequence[Variant], used: Variant, fastest: float) -> tuple[list[Parameter], dict[str, Any]]:
+def _doubt(
+    variants: Sequence[Variant], used: Variant, fastest: float, choices: ModelChoices
+) -> tuple[list[Parameter], dict[str, Any]]:
     """Parameters that the mean over the laws moves by ``DOUBTFUL`` sd (Hoeting et al. 1999), and the facts of its words.
 
     The mean is over the laws that have the parameter, by their probabilities. ``fastest``: largest speed of a slide, m/s.
@@ -245,7 +249,7 @@ def _doubt(variants: Sequence[Variant], used: Variant, fastest: float) -> tuple[
     other = max(wider, key=lambda variant: variant.evidence, default=used)
     return moved, {
         "other": None if other is used else other.model.name,
-        "other_line": model_lines(other.model),
+        "other_line": model_lines(other.model, choices),
         "other_factor": float(np.exp(np.clip(other.evidence - used.evidence, -700.0, 700.0))),
         "slow": fastest < FAST * means["v_s"],
         "shift": max(shifts.values()),
@@ -258,17 +262,19 @@ def _doubt(variants: Sequence[Variant], used: Variant, fastest: float) -> tuple[
 
 
 def _corrected(e: Any, fit: Fitted) -> Any:
-    """The experiment without the errors of its instruments that the fit found: they are no property of the law."""
-    if not e.instruments:
+    """The experiment at the slope and N0 that the fit found, without the errors of its instruments: no law has them."""
+    sampled = [name for name, value in e.ground.items() if value is None]
+    if not (e.instruments or sampled):
         return e
     theta, columns = e.local(fit.values), dict(e.table.columns)
+    settings = replace(e.table.settings, **{name: Quantity(float(theta[name])) for name in sampled})
     for name, _ in e.instruments:
         factor, offset = e.instrument(name, theta)
         values = (columns[name].values - offset) / factor
         if np.any(values <= 0.0):  # a point of the paper is positive
             return e
         columns[name] = replace(columns[name], values=values, instrument=None)
-    return type(e)(replace(e.table, columns=columns), e.rig, e.friction)
+    return type(e)(replace(e.table, columns=columns, settings=settings), e.rig, e.friction)
 
 
 def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
@@ -280,22 +286,24 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
     """
     # Laws that depend on the speed can be compared where each reading has one.
     experiments = [e for e in experiments if e.role == "static" or "speed" in e.table.columns]
+    experiments = [e for e in map(partial(_corrected, fit=fit), experiments) if np.all(e.paper_points()[1] > 0.0)]
     in_use = replace(experiments[0].friction, direction="both", contact=None) if experiments else FrictionModel()
     if in_use.law is not CoulombStribeck or sum(e.n for e in experiments if e.role != "static") < FEWEST_SLIDES:
         return []
-    points = VariantPoints([_corrected(e, fit) for e in experiments])
+    points = VariantPoints(experiments)
     variants = [fit_variant(points, model, SEED) for model in candidates(experiments)]
     highest = max(variant.evidence for variant in variants)
     used = next(variant for variant in variants if variant.model == in_use)
     simplest = next(variant for variant in variants if highest - variant.evidence < np.log(TELLING))
-    (moved, doubt), rig = _doubt(variants, used, float(np.max(points.speed))), experiments[0].rig
+    rig = experiments[0].rig
+    moved, doubt = _doubt(variants, used, float(np.max(points.speed)), rig.model)
     facts = {
         "name": in_use.name,
         "labels": ", ".join(e.label for e in experiments),
         "count": len(variants),
         "factor": float(np.exp(min(highest - used.evidence, 700.0))),
         "simplest": simplest.model.name,
-        "line": model_lines(simplest.model),
+        "line": model_lines(simplest.model, rig.model),
         "p": used.lack_of_fit,
         **doubt,
         "tilts": any(e.role == "static" for e in experiments),
@@ -312,7 +320,7 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
             "BIC": variant.bic - min(other.bic for other in variants),
             "log marginal likelihood": variant.evidence - highest,
             "order of residuals, p": variant.lack_of_fit,
-            "[model]": model_lines(variant.model),
+            "[model]": model_lines(variant.model, rig.model),
         }
         for variant in variants
     ]

@@ -21,6 +21,7 @@ from capsule_id.errors import InputError
 from capsule_id.parameters import Parameter, symbol_of
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import KindRule, parameter_rows
+from capsule_id.rig.toml import shown
 from capsule_id.views import Comparison, Finding, Message
 
 if TYPE_CHECKING:
@@ -327,6 +328,13 @@ def make_experiments(
     model = friction_of(rig, friction, contact)
     model.check(kinds.parameters)
     made = tuple(e for table in tables for e in kinds[table.kind].make(table, rig, model))
+    labels = [e.label for e in made]
+    if same := next((label for label in labels if labels.count(label) > 1), None):
+        rule, remedy = (
+            "the channels of all experiments must have different names",
+            'give one entry a label of its own: label = "..."',
+        )
+        raise InputError(rule, f"two are {shown(same)}", remedy, rig.folder / "rig.toml")
     measured = {row.symbol for e in made for row in e.parameters}
     for symbol in rig.model.free if experiments == "all" else ():
         if symbol not in measured:

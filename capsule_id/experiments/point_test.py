@@ -565,6 +565,11 @@ class Line(PointTest):
         """The slope of the readings, which the gains of both instruments change."""
         return {self.x_name: self.as_read(theta[self.symbol], self.x_name, theta)}
 
+    def shown(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        """The line through the means of the readings: the intercept stands there, wherever the zeros of both columns are."""
+        slope = self.as_read(theta[self.symbol], self.x_name, theta)
+        return self.observed.mean() + slope * (x[self.x_name] - self.x.mean())
+
     def design(self, n: int, xp: ModuleType = jnp) -> Any:
         return self.width * xp.ones((n, 1))
 

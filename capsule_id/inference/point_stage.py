@@ -262,7 +262,7 @@ def compare_laws(target: LogPosterior, fit: PointFit, seed: int) -> list[Finding
     facts = {
         "own": own.name,
         "law": chosen.name,
-        "line": model_lines(chosen),
+        "line": model_lines(chosen, target.rig.model),
         "better": own not in close,
         "gain": behind[own][0] - behind[chosen][0],
         "moved": [(name, quoted.values[name], new[name]) for name in quoted.physical if name in new],

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
@@ -296,6 +297,11 @@ def test_lines_of_model() -> None:
     assert model_lines(FrictionModel()) == 'friction = "stribeck"'
     lines = model_lines(FrictionModel(free=("viscous",), constant=True))
     assert lines == 'friction = "constant", and on the next line free = ["viscous"]'
+    # Before: lines that were refused beside those of [model], or that dropped its other words.
+    stated = ModelChoices(friction="constant", free=("viscous", "k_cubic"))
+    lines = model_lines(FrictionModel(free=("ratio",)), stated)
+    assert lines.startswith('friction = "stribeck", and on the next line free = ["ratio", "k_cubic"] (in place of')
+    assert model_lines(FrictionModel(), ModelChoices(free=("ratio",))).startswith("free = [] (in place of")
 
 
 def test_memory_does_not_grow_with_readings() -> None:
@@ -322,3 +328,37 @@ def test_groups_of_many_readings_say_what_the_readings_say(monkeypatch: pytest.M
         assert abs(one.values["mu"] - other.values["mu"]) < 0.3 * other.sds["mu"]
         assert one.evidence - grouped[1].evidence == pytest.approx(other.evidence - alone[0].evidence, abs=1.0)
     assert grouped[0].evidence < grouped[1].evidence - 100.0
+
+
+def test_the_slope_that_the_fit_finds_is_no_property_of_the_law(tmp_path: Path) -> None:
+    """Before: eq. (1) was rejected on a track of -1.5 deg that the fit had found."""
+    rng, speed = np.random.default_rng(7), np.tile([0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.2], 3)
+    weight, slope = 0.64 * 9.81, np.deg2rad(-1.5)
+    tilt = np.rad2deg(np.arctan(0.5)) + 0.3 * rng.standard_normal(10)
+    law = 0.25 * (1.0 + np.exp(-speed / 0.3))
+    force = weight * (law * np.cos(slope) + np.sin(slope)) * (1.0 + 0.005 * rng.standard_normal(21))
+    pd.DataFrame({"angle [deg]": tilt}).to_csv(tmp_path / "s.csv", index=False)
+    pd.DataFrame({"speed [m/s]": speed, "force [N]": force}).to_csv(tmp_path / "f.csv", index=False)
+    (tmp_path / "rig.toml").write_text(
+        '[rig]\nname = "slope"\nm1 = { value = 0.11, sd = 0.0005, unit = "kg" }\nm2 = { value = 0.53, sd = 0.001, unit = "kg" }\n'
+        '[[experiment]]\nkind = "static_friction"\nfile = "s.csv"\nangle_resolution = { value = 0.1, unit = "deg" }\n'
+        '[[experiment]]\nkind = "sliding_friction"\nfile = "f.csv"\nslope = { value = 0, sd = 1, unit = "deg" }\n'
+    )
+    fit = cid.fit(tmp_path, budget=None)
+    assert fit.summary.loc["slope[f]", "value"] == pytest.approx(slope, abs=0.004)
+    levels = {finding.code: finding.level for finding in fit.findings}
+    assert levels["friction.variants"] == levels["friction.order"] == "ok"
+
+
+def test_a_pull_below_the_weight_along_the_slope_has_no_point(tmp_path: Path) -> None:
+    """Before: the comparison of laws did not end."""
+    rng, slope = np.random.default_rng(0), np.deg2rad(20.0)
+    force = 0.64 * 9.81 * (0.02 * np.cos(slope) + np.sin(slope)) + 0.15 * rng.standard_normal(8)
+    force[2] = 0.64 * 9.81 * np.sin(slope) - 0.1
+    frame = pd.DataFrame({"speed [m/s]": np.geomspace(0.02, 1.0, 8), "force [N]": force})
+    frame.to_csv(tmp_path / "p.csv", index=False)
+    (tmp_path / "rig.toml").write_text(
+        '[rig]\nname = "slope"\nm1 = { value = 0.11, sd = 0.0005, unit = "kg" }\nm2 = { value = 0.53, sd = 0.001, unit = "kg" }\n'
+        '[[experiment]]\nkind = "sliding_friction"\nfile = "p.csv"\nslope = { value = 20, unit = "deg" }\n'
+    )
+    assert "friction.variants" not in {finding.code for finding in cid.fit(tmp_path, budget=None).findings}

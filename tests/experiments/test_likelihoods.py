@@ -126,7 +126,7 @@ def test_lines(
     columns = [bench.column("force", FORCE, force_sd), bench.column("current", CURRENT, current_sd)]
     experiment = make(bench.table("motor_current", columns, sd_ratio=ratio))
     sd = np.sqrt(variance) * np.ones(9)
-    expected = wide(sd, np.ones((9, 1)), FORCE).logpdf(FORCE - 2.1 * CURRENT)
+    expected = wide(sd, np.ones((9, 1)), FORCE).logpdf(FORCE - np.mean(FORCE) - 2.1 * (CURRENT - np.mean(CURRENT)))
     expected += 9 * np.log(np.sqrt(variance / force_variance))
     assert_log_likelihood(experiment, {"K": 2.1, "scatter": 1.2, **MASSES}, expected)
 
@@ -137,7 +137,9 @@ def test_support_spring() -> None:
     columns = [bench.column("deflection", deflection), bench.column("force", force, None, 2.0)]
     experiment = make(bench.table("support_spring", columns, spring="soft"))
     sd = np.sqrt(1.5**2 + 2.0**2 / 12.0) * np.ones(11)
-    expected = wide(sd, np.ones((11, 1)), force).logpdf(force - 2400.0 * deflection)
+    expected = wide(sd, np.ones((11, 1)), force).logpdf(
+        force - np.mean(force) - 2400.0 * (deflection - np.mean(deflection))
+    )
     assert_log_likelihood(experiment, {"k2": 2400.0, "scatter": 1.5, **MASSES}, expected)
 
 

@@ -147,7 +147,8 @@ def test_a_scatter_beside_one_stated_error_does_not_vanish() -> None:
     for own in (1e-9, 0.3):
         theta = {"k2": 22.5, "scatter": own}
         covariance = ((22.5 * 5e-3) ** 2 + own**2) * np.eye(5) + line.width**2
-        expected = stats.multivariate_normal(np.zeros(5), covariance).logpdf(WEIGHTS - 22.5 * RULER)
+        apart = WEIGHTS - np.mean(WEIGHTS) - 22.5 * (RULER - np.mean(RULER))
+        expected = stats.multivariate_normal(np.zeros(5), covariance).logpdf(apart)
         assert float(line.log_likelihood(theta, np)) == pytest.approx(expected, abs=1e-6)
 
 
@@ -158,3 +159,16 @@ def test_a_ratio_beside_one_stated_error_has_a_density_with_a_limit() -> None:
     )
     small, fitted = (float(line.log_likelihood({"k2": 22.5, "scatter": own}, np)) for own in (1e-9, 0.3))
     assert small < fitted
+
+
+@pytest.mark.parametrize("sd", [None, 2e-6])
+def test_zeros_far_from_the_readings_change_nothing(sd: float | None) -> None:
+    """Before: the intercept's prior stood at (0, 0), ten ranges wide, and k2 was 267 for 5000 N/m, trusted."""
+    deflection = np.linspace(0.0, 1e-3, 8)
+    force = 5000.0 * deflection + 0.05 * np.random.default_rng(1).standard_normal(8)
+    densities = []
+    for x, y in ((0.0, 0.0), (0.25, 0.0), (0.0, 8e3)):
+        columns = [bench.column("force", y + force, sd and 0.05), bench.column("deflection", x + deflection, sd)]
+        line = SupportSpring(table := bench.table("support_spring", columns, spring="a"), bench.rig(table))
+        densities.append([line.log_likelihood({"k2": k2, "scatter": 0.05}, np) for k2 in (4900.0, 5000.0, 5100.0)])
+    np.testing.assert_allclose(densities[1:], [densities[0]] * 2, rtol=1e-9)

@@ -121,7 +121,7 @@ def _faults(entry: Entry[DecaySettings]) -> Iterator[tuple[Any, ...]]:
             "forward",
             "forward capsule has viscous damping, a linear spring and white noise only",
             model.name,
-            'write forward = "closed", or remove damping, stiffness, drift, noise and hum',
+            'write forward = "closed", or remove damping, stiffness, drift, noise, hum and thin',
         ),
         *(
             (

@@ -96,28 +96,31 @@ def check_stiffness(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding
     return [Finding("decays.stiffness", "fail" if p < LEVEL else "ok", facts)]
 
 
-def check_free_decay(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
+def check_free_decay(decays: Sequence[Decay], fit: Fitted) -> list[Finding]:
     """Check that a free capsule does not slip and that the rod does not touch the support spring.
 
     A capsule counts as held unless stated: where it would slip if it were not, further forces that no setting states are
-    in doubt, since the slip looks like one.
+    in doubt, since the slip looks like one. A free one slips unseen where no experiment determines the friction.
     """
     findings, theta = [], fit.values
-    for e in records:
+    for e in decays:
         needed = {"m2", *(row.symbol for row in e.friction.parameters_at_rest)}
         free, found = e.table.settings.capsule == "free", e.model.symbols if e.replaced else ()
-        if (free or found) and needed <= set(theta):
+        known = needed <= set(theta)
+        if free or (found and known):
             force = theta["k1"] * e.largest_deflection
-            if e.order == 0:  # f = k1 x_rel + c d(x_rel)/dt
+            if isinstance(e, DecayRecord) and e.order == 0:  # f = k1 x_rel + c d(x_rel)/dt
                 x = e.smoothed() - equilibrium(e.values)
                 force = float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, e.condensed[0]))))
-            threshold = float(e.friction.force(theta).forward(0.0))
-            if force > threshold:
-                facts, doubtful = {"force": force, "F_b": threshold, "label": e.label}, () if free else ("c", *found)
-                findings.append(Finding("decays.slip", "fail" if free else "warn", facts, e.label, doubtful))
+            threshold = float(e.friction.force(theta).forward(0.0)) if known else None
+            if threshold is None or force > threshold:
+                facts: Facts = {"force": force, "F_b": threshold, "label": e.label}
+                sure, doubtful = free and known, ("c", *found) if known else ("k1", "c", *e.model.symbols)
+                findings.append(
+                    Finding("decays.slip", "fail" if sure else "warn", facts, e.label, () if sure else doubtful)
+                )
         for gap, side in ((e.table.settings.gap, 1.0), (e.table.settings.gap_back, -1.0)):
-            moved = side * (e.values - equilibrium(e.values))
-            reach = float(np.max(moved)) if e.order == 0 else e.largest_deflection
+            reach = float(np.max(side * e.moved))
             if gap is not None and reach >= gap.value:
                 findings.append(
                     Finding("decays.contact", "fail", {"reach": side * reach, "gap": side * gap.value}, e.label)
@@ -259,10 +262,14 @@ def later_start(e: DecayRecord) -> Facts:
     # Half of what a record needs whose halves are compared.
     few = len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_SWINGS // 2
     # Beyond half of critical damping one exponential is left of a decay.
-    if few or e.rough.c * e.rough.Omega_o > e.rough.k1:
+    if few or e.rough.c * e.rough.Omega_o > e.rough.k1 or e.table.settings.releases:
         return {"start": None}
-    digits = max(0, int(np.ceil(-np.log10(median_step(e.time)))))
-    return {"start": float(np.round(decay_window(e.table)[0][0] + e.time[begin], digits))}
+    return {"start": rounded(decay_window(e.table)[0][0] + e.time[begin], e.time)}
+
+
+def rounded(instant: float, time: np.ndarray) -> float:
+    """An instant with as many digits, s, as the steps of the times (n,) have."""
+    return float(np.round(instant, max(0, int(np.ceil(-np.log10(median_step(time)))))))
 
 
 def fast_rms(time: np.ndarray, values: np.ndarray, half: float) -> float | None:
@@ -344,7 +351,8 @@ def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | None:
     # After half a period a part of an exponential release is left; after a period nothing of a strongly damped decay.
     light = theta["c"] < np.sqrt(theta["k1"] * theta["m1"])
     free = e.time[light & (e.time > e.time[0] + 2.0 * half)]
-    start = float(decay_window(e.table)[0][0] + free[0]) if len(free) > SHORTEST else None
+    kept = len(free) > SHORTEST and not e.table.settings.releases
+    start = rounded(decay_window(e.table)[0][0] + free[0], e.time) if kept else None
     return {**facts, "p": p, "start": start, "half": half}, p
 
 

@@ -19,6 +19,7 @@ from capsule_id.experiments.free_vibration.readings import (
     first_periods,
     release_time,
     window_of,
+    without_hum,
 )
 from capsule_id.experiments.lint import (
     ACCELERATIONS,
@@ -41,7 +42,7 @@ from capsule_id.records.faults import (
     phasor,
     sampling,
 )
-from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
+from capsule_id.records.release import MARGIN, FreeDecay, find_free_decay, find_releases
 from capsule_id.records.tones import length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, uneven_sampling
 from capsule_id.rig.model import Rig, Table
@@ -84,7 +85,8 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         return
     channels = [name for name in table.columns if name != "time"]
     time = table["time"]
-    decay = find_free_decay(time[used], table[channels[0]][used], displacement=channels[0] == "x_rel")
+    values = without_hum(time[used], table[channels[0]][used], table.settings.hum)
+    decay = find_free_decay(time[used], values, displacement=channels[0] == "x_rel")
     period = np.inf if decay is None else decay.period
     if decay is not None:  # a hold is neither clipped nor frozen
         used = slice(used.start + int(np.searchsorted(time[used], decay.start)), used.stop)
@@ -143,7 +145,8 @@ def _named(table: Table[Any], release: Sequence[Finding], faults: Sequence[Findi
 
 def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[Finding]:
     """Report a frequency that differs from that of the first decay of the rig, whose k1 and m1 are the same."""
-    first = next((other for other in rig.tables if other.kind == table.kind), table)
+    records = (other for other in rig.tables if other.kind == table.kind and other.settings.samples == "record")
+    first = next(records, table)
     channel = next(name for name in first.columns if name != "time")
     if first.label == table.label or channel not in table.columns:
         return
@@ -236,6 +239,13 @@ def _held(table: Table[Any], rows: Iterable[Row]) -> Iterable[Finding]:
     yield from (Finding(code, level, facts, table.label, own) for holds, code, level, facts, own in rows if holds)
 
 
+#: What a release means where the capsule may move.
+EXACT_RELEASE = (
+    ", with the instant at which the rod was let go: the capsule may slip from there on, and the model begins with both at "
+    "rest, so k1 and c are not judged without it"
+)
+
+
 def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Finding]:
     """Report rest before the release, and a second excitation; a ``faulty`` record may feign the latter."""
     start, stop = release_time(decay), decay.stop
@@ -254,10 +264,15 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
     digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
     other = " For the part after that, add instead: " + line_of("start").format(start=start) if earlier else ""
     other += add
-    second: Facts = {"file": table.file, "stop": round(stop or 0.0, digits), "found": stop, "other": other}
-    stated = table.settings.start is not None
+    ended = round(stop or 0.0, digits)
+    second: Facts = {"file": table.file, "stop": ended, "found": ended, "other": other}
+    stated, doubtful = table.settings.start is not None, ()
+    if settings.forward == "capsule" and not stated:
+        # The capsule moves soon after the release, and the model begins with a capsule at rest.
+        rest |= {"start": round(decay.start - MARGIN * decay.period, digits), "longer": EXACT_RELEASE}
+        doubtful = ("k1", "c")
     rows: tuple[Row, ...] = (
-        (decay.rest > 0.0 and not earlier, "decays.release", "fail" if stated else "warn", rest, ()),
+        (decay.rest > 0.0 and not earlier, "decays.release", "fail" if stated else "warn", rest, doubtful),
         (stop is not None and not faulty, "decays.second", "fail", second, ()),
     )
     yield from _held(table, rows)
@@ -294,7 +309,7 @@ def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterab
 
 def line_of(key: str) -> str:
     """A line of rig.toml that states ``key`` of the facts."""
-    return f'{key} = {{{{ value = {{{key}:.10g}}, unit = "s" }}}}'
+    return f'{key} = {{{{ value = {{{key}:.15g}}, unit = "s" }}}}'
 
 
 _UNIT = " Check first the unit of the times and of m1. If they are right, sample faster."
@@ -376,7 +391,7 @@ LINT_MESSAGES = {
     "decays.second": Message(
         "end of a decay",
         fail=(
-            "the energy of a free decay must not grow; it grows after {found:.5g} s. Add this line to the experiment in "
+            "the energy of a free decay must not grow; it grows after {found:.15g} s. Add this line to the experiment in "
             "rig.toml: " + line_of("stop") + "{other}"
         ),
     ),
@@ -549,6 +564,21 @@ def _changing(facts: Facts) -> str:
     )
 
 
+def _slip(facts: Facts) -> str:
+    """What a capsule that may slip means for the numbers, with the friction known or not."""
+    text = (
+        "{label}: the rod pushes with {force:.3g} N, more than friction holds, F_b = {F_b:.3g} N. A capsule that is not "
+        "held slips then, and that looks like the further force found here. If it was held, state the words of damping "
+        "and stiffness that the second fit names; else hold it, or release from a smaller deflection."
+    )
+    if facts["F_b"] is None:
+        text = (
+            "{label}: the rod pushes with {force:.3g} N, and no experiment tells whether friction then holds a free capsule, "
+            "so these numbers are not judged. Add a test of static friction, or hold the capsule and remove capsule."
+        )
+    return filled_in(text, facts)
+
+
 _HELD = (
     "{label}: the readings do not tell the release from one up to a quarter of a period later. {name} then lies between "
     "{low:.3g} and {high:.3g} {unit} (the fit: {value:.3g})."
@@ -597,11 +627,7 @@ MESSAGES = {
     ),
     "decays.slip": Message(
         "free decay",
-        warn=(
-            "{label}: the rod pushes with {force:.3g} N, more than friction holds, F_b = {F_b:.3g} N. A capsule that is not "
-            "held slips then, and that looks like the further force found here. If it was held, state the words of damping "
-            "and stiffness that the second fit names; else hold it, or release from a smaller deflection."
-        ),
+        warn=_slip,
         fail=(
             "expected a free capsule at rest, |f| <= F_b = {F_b:.3g} N; the record reaches {force:.3g} N, so the capsule "
             "slips and this is no free decay. Hold the capsule, or release from a smaller deflection."
@@ -701,7 +727,7 @@ MESSAGES = {
     "decays.first_fit": Message(
         "second fit of free decays",
         warn=(
-            "{record}: no second fit, because the record is not one free decay. The fit uses means of {thin} samples. "
+            "{record}: no second fit, because the record is not one free decay. A mean of the fit holds {thin:# sample}. "
             "Add the line that the finding on the readings states."
         ),
     ),

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.decrement import decay_frequency
+from capsule_id.experiments.free_vibration.decrement import decay_frequency, viscous_fit
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.release import FreeDecay, find_free_decay, find_releases
 from capsule_id.rig.filters import loudest_part, median_step, uneven_sampling
@@ -162,11 +162,20 @@ def block_mean(values: Any, weights: Any, xp: Any) -> Any:
     return xp.einsum("nq,nq...->n...", weights, xp.reshape(values, shape))
 
 
-def hum_columns(time: Any, hum: float, xp: Any) -> Any:
+def hum_columns(time: Any, hum: Any, xp: Any) -> Any:
     """(n, 4) cosine and sine of this frequency, Hz, at the times (n,), s, and both times a slope: size and phase may drift."""
     angle = 2.0 * np.pi * hum * time
     tone = xp.stack([xp.cos(angle), xp.sin(angle)], axis=1)
     return xp.concatenate([tone, (time / time[-1] - 0.5)[:, None] * tone], axis=1)
+
+
+def without_hum(time: np.ndarray, values: np.ndarray, hum: float | None) -> np.ndarray:
+    """The values (n,) of a decay without hum of this frequency, Hz, beside a viscous decay: it would be taken for swings."""
+    time, tone = time - time[0], np.zeros_like(values)
+    for _ in range(2 if hum else 0):
+        columns = hum_columns(time, hum, np)
+        tone = columns @ np.linalg.lstsq(columns, viscous_fit(time, values - tone).left + tone)[0]
+    return values - tone
 
 
 # settings: Settings of a free vibration, the model that they state, and the window that contains the free decay.
@@ -387,7 +396,8 @@ def cut_at_release(table: Table[DecaySettings]) -> Table[DecaySettings]:
     settings = table.settings
     if settings.start is not None or settings.samples != "record":
         return table
-    decay = find_free_decay(*decay_window(table), displacement=channel_of(table) == "x_rel")
+    time, values = decay_window(table)
+    decay = find_free_decay(time, without_hum(time, values, settings.hum), displacement=channel_of(table) == "x_rel")
     if decay is None or decay.rest == 0.0:
         return table
     return replace(table, settings=replace(settings, start=release_time(decay)))

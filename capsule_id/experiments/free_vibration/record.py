@@ -66,6 +66,7 @@ from capsule_id.experiments.free_vibration.readings import (
     further_parameters,
     hum_columns,
     is_even,
+    without_hum,
 )
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
@@ -251,8 +252,13 @@ class Decay(SurfaceExperiment):
 
     @property
     @abstractmethod
+    def moved(self) -> np.ndarray:
+        """Distances from the rest position, m; of another channel its largest distances to both sides."""
+
+    @property
     def largest_deflection(self) -> float:
-        """Largest distance of a reading from the rest position, m."""
+        """Largest distance from the rest position, m."""
+        return float(np.max(np.abs(self.moved)))
 
     @property
     def rough(self) -> Decrement:
@@ -520,14 +526,10 @@ class DecayRecord(Decay):
     def condensed(self) -> tuple[np.ndarray, np.ndarray]:
         """As ``whole``; of a long record block means, for the paper's estimate. Their times start at the first mean.
 
-        Hum of the model is taken off beside a viscous decay: it would be taken for swings.
+        Hum of the model is taken off.
         """
         time, values = shortened(*decay_window(self.table))
-        time, tone = time - time[0], np.zeros_like(values)
-        for _ in range(2 if self.model.hum else 0):
-            columns = hum_columns(time, self.model.hum, np)
-            tone = columns @ np.linalg.lstsq(columns, viscous_fit(time, values - tone).left + tone)[0]
-        return time, values - tone
+        return time - time[0], without_hum(time, values, self.model.hum)
 
     def smoothed(self) -> np.ndarray:
         """The condensed record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
@@ -578,8 +580,9 @@ class DecayRecord(Decay):
         return first - back * half_period, peak * (-1.0) ** back * growth
 
     @property
-    def largest_deflection(self) -> float:
-        return self.deflection * float(np.max(np.abs(self.values - equilibrium(self.values))))
+    def moved(self) -> np.ndarray:
+        moved = self.values - equilibrium(self.values)
+        return moved if self.order == 0 else self.deflection * float(np.max(np.abs(moved))) * np.array([1.0, -1.0])
 
     @property
     def cycles(self) -> np.ndarray:

@@ -21,7 +21,7 @@ from capsule_id.experiments.base import (
 )
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
-from capsule_id.experiments.free_vibration.experiment import Graded, each, graded, halves
+from capsule_id.experiments.free_vibration.experiment import Graded, check_free_decay, each, graded, halves
 from capsule_id.experiments.free_vibration.hidden_terms import (
     FEWEST_HALF_SWINGS,
     check_hidden_terms,
@@ -285,7 +285,13 @@ class TurningPoints(Decay):
 
     title = "turning points of a free decay"
     scatters: ClassVar[tuple[str, str]] = ("noise_sd", "time_sd")
-    checks = (check_steps, each("decays.forces", forces), halves(changes_of_second_half), check_hidden_terms)
+    checks = (
+        check_steps,
+        each("decays.forces", forces),
+        halves(changes_of_second_half),
+        check_free_decay,
+        check_hidden_terms,
+    )
 
     def __init__(
         self,
@@ -348,8 +354,12 @@ class TurningPoints(Decay):
         return (columns.T / self.misfit(theta).sd).T
 
     @property
-    def largest_deflection(self) -> float:
-        return float(np.max(np.abs(self.values)))
+    def moved(self) -> np.ndarray:
+        peaks = self.rough.peaks
+        # Between two turning points of one side lies one of the other side.
+        return (
+            peaks if self.both_sides else np.append(peaks, -np.sign(peaks[0]) * np.sqrt(np.abs(peaks[1:] * peaks[:-1])))
+        )
 
     @property
     def observed(self) -> np.ndarray:
