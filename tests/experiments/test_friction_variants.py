@@ -340,7 +340,7 @@ def test_the_slope_that_the_fit_finds_is_no_property_of_the_law(tmp_path: Path) 
     pd.DataFrame({"angle [deg]": tilt}).to_csv(tmp_path / "s.csv", index=False)
     pd.DataFrame({"speed [m/s]": speed, "force [N]": force}).to_csv(tmp_path / "f.csv", index=False)
     (tmp_path / "rig.toml").write_text(
-        '[rig]\nname = "slope"\nm1 = { value = 0.11, sd = 0.0005, unit = "kg" }\nm2 = { value = 0.53, sd = 0.001, unit = "kg" }\n'
+        '[rig]\nname = "slope"\nm1 = { value = 0.11, sd = 0.0005, unit = "kg" }\nm2 = { value = 0.53, unit = "kg" }\n'
         '[[experiment]]\nkind = "static_friction"\nfile = "s.csv"\nangle_resolution = { value = 0.1, unit = "deg" }\n'
         '[[experiment]]\nkind = "sliding_friction"\nfile = "f.csv"\nslope = { value = 0, sd = 1, unit = "deg" }\n'
     )
@@ -358,7 +358,7 @@ def test_a_pull_below_the_weight_along_the_slope_has_no_point(tmp_path: Path) ->
     frame = pd.DataFrame({"speed [m/s]": np.geomspace(0.02, 1.0, 8), "force [N]": force})
     frame.to_csv(tmp_path / "p.csv", index=False)
     (tmp_path / "rig.toml").write_text(
-        '[rig]\nname = "slope"\nm1 = { value = 0.11, sd = 0.0005, unit = "kg" }\nm2 = { value = 0.53, sd = 0.001, unit = "kg" }\n'
+        '[rig]\nname = "slope"\nm1 = { value = 0.11, sd = 0.0005, unit = "kg" }\nm2 = { value = 0.53, unit = "kg" }\n'
         '[[experiment]]\nkind = "sliding_friction"\nfile = "p.csv"\nslope = { value = 20, unit = "deg" }\n'
     )
     assert "friction.variants" not in {finding.code for finding in cid.fit(tmp_path, budget=None).findings}

@@ -1,5 +1,6 @@
 """Turning points of a decay, and records too short or too slowly sampled for a fit."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,11 +14,13 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.turning_points import TurningPoints, fitted, screened
 from capsule_id.experiments.kind import default_registry, make_experiments
+from capsule_id.experiments.lint import lint
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.report.messages import finding_text, messages_of
-from capsule_id.rig.model import Quantity
+from capsule_id.rig.model import Column, Quantity
 from capsule_id.views import Finding
+from tests.experiments import bench
 from tests.scipy_decay import scipy_decay
 
 FORCES = {"k1": 9.6, "c": 0.12, "m1": 1.0}
@@ -294,3 +297,90 @@ def test_turning_points_at_unequal_times_are_refused(tmp_path: Path) -> None:
     time, x = turning_points(True, {}, 1)
     rig = cid.read_rig(folder(tmp_path / "missed", np.delete(time, 4), np.delete(x, 4), 'samples = "turning_points"'))
     assert len(make_experiments(rig)) == 1
+
+
+def _viscous_turns(release: float, one_side: bool = False) -> list[Column]:
+    """Turning points of a viscous decay of the bench from ``release``, m, with small errors."""
+    rng, gamma = np.random.default_rng(2), bench.C / (2.0 * bench.M1)
+    step = np.pi / np.sqrt(bench.K1 / bench.M1 - gamma**2)
+    index = np.arange(16)[:: 1 + one_side]
+    x = release * np.exp(-gamma * index * step) * (-1.0) ** index
+    return [
+        bench.column("time", index * step + 1e-5 * rng.standard_normal(len(index))),
+        bench.column("x_rel", x + 2e-6 * rng.standard_normal(len(index))),
+    ]
+
+
+@pytest.mark.parametrize("one_side", [False, True])
+@pytest.mark.parametrize(
+    ("settings", "code"),
+    [({"capsule": "free"}, "decays.slip"), ({"gap_back": Quantity(1e-3)}, "decays.contact"), ({}, "")],
+)
+def test_slip_and_contact_of_turning_points(settings: dict[str, Any], code: str, one_side: bool) -> None:
+    """Before: neither was looked at, and the numbers were trusted."""
+    table = bench.table("free_vibration", _viscous_turns(4e-3, one_side), samples="turning_points", **settings)
+    tilts = bench.table("static_friction", [bench.column("angle", np.arctan(0.4) + 0.005 * np.array([-1.0, 0.0, 1.0]))])
+    result = cid.fit(bench.rig(table, tilts), budget=None)
+    found = {finding.code for finding in result.findings if finding.level == "fail"}
+    assert found & {"decays.slip", "decays.contact"} == ({code} if code else set())
+
+
+@pytest.mark.parametrize("samples", ["turning_points", "record"])
+def test_a_free_capsule_without_a_test_of_friction_is_not_judged(samples: str) -> None:
+    """Before: nothing was said, and c was trusted 11 sd off where the capsule had slipped."""
+    time = np.arange(400) / 1000.0
+    record = [bench.column("time", time), bench.column("x_rel", bench.released(time, 4e-3))]
+    noise = 2e-6 * np.random.default_rng(0).standard_normal(400)
+    record[1] = bench.column("x_rel", bench.released(time, 4e-3) + noise)
+    columns = _viscous_turns(4e-3) if samples == "turning_points" else record
+    result = cid.fit(bench.rig(bench.table("free_vibration", columns, samples=samples, capsule="free")), budget=None)
+    (slip,) = [finding for finding in result.findings if finding.code == "decays.slip"]
+    assert (slip.level, {"k1", "c"} <= set(slip.parameters)) == ("warn", True)
+    assert "Add a test of static friction" in result.text(slip)
+
+
+def test_amplitudes_of_one_side_have_no_frequency_of_a_record() -> None:
+    """Before: a record beside them was not trusted, its frequency 700 times theirs."""
+    time = np.arange(400) / 1000.0
+    record = [bench.column("time", time), bench.column("x_rel", bench.released(time, 2e-3))]
+    turns = bench.table("free_vibration", _viscous_turns(2e-3, one_side=True), "turns", samples="turning_points")
+    rig = bench.rig(turns, bench.table("free_vibration", record, "record"))
+    codes = {finding.code for finding in lint(rig, default_registry(), rig.tables)}
+    assert "decays.frequency" not in codes
+
+
+def test_a_stated_hum_is_no_release() -> None:
+    """Before: the hum beside the first swing was taken for rest, or for a second excitation, stated or not."""
+    rng, time = np.random.default_rng(0), np.arange(1000) / 2000.0
+    x = bench.released(time, 2e-3, 1500.0, 2.0) + 5e-5 * np.cos(2.0 * np.pi * 50.02 * time + 1.0)
+    columns = [bench.column("time", time), bench.column("x_rel", x + 1e-5 * rng.standard_normal(1000))]
+    codes = {}
+    for hum in (None, 50.02):
+        rig = bench.rig(bench.table("free_vibration", columns, hum=hum))
+        codes[hum] = {finding.code for finding in lint(rig, default_registry(), rig.tables) if finding.level != "ok"}
+    assert "decays.release" in codes[None]
+    assert codes[50.02] == {"masses.exact"}
+
+
+def test_instants_keep_their_digits() -> None:
+    """Times since 1970. Before: the printed start was rounded to a whole second."""
+    begin, rest = 1.7e9 + 0.37, np.arange(200) / 1000.0
+    time = np.append(rest, 0.2 + np.arange(600) / 1000.0)
+    x = np.append(np.full(200, 2e-3), bench.released(np.arange(600) / 1000.0, 2e-3))
+    x += 2e-6 * np.random.default_rng(0).standard_normal(800)
+    rig = bench.rig(bench.table("free_vibration", [bench.column("time", begin + time), bench.column("x_rel", x)]))
+    kinds = default_registry()
+    (found,) = [finding for finding in lint(rig, kinds, rig.tables) if finding.code == "decays.release"]
+    text = finding_text(found, messages_of(kinds))
+    (start,) = re.findall(r"start = \{ value = ([0-9.]+)", text)
+    assert 0.0 <= float(start) - (begin + 0.2) < 0.01
+
+
+def test_channels_have_different_names() -> None:
+    """Before: two records of one label shared one noise, and one was lost from posterior.nc."""
+    time = np.arange(400) / 1000.0
+    both = [bench.column(name, bench.released(time, 2e-3)) for name in ("x_rel", "velocity")]
+    tables = [bench.table("free_vibration", [bench.column("time", time), *both], "a")]
+    tables += [bench.table("free_vibration", [bench.column("time", time), both[0]], "a_velocity")]
+    with pytest.raises(InputError, match="different names"):
+        make_experiments(bench.rig(*tables))
