@@ -352,11 +352,19 @@ def wrong_prefix(ratio: float) -> bool:
     return bool(abs(abs(np.log10(ratio)) - np.log10(PREFIX)) < NEAR_PREFIX)
 
 
+#: Columns that are often measured once for all rows.
+MEASURED_ONCE = ("length", "normal_force")
+
+
 def lint_rows(table: Table[Any], rig: Rig, unknowns: int) -> Iterable[Finding]:
-    """Warn where a table has few rows: fewer than three for one unknown, five for two."""
+    """Warn of few rows, fewer than three for one unknown, five for two, and of an sd of what was measured once for all rows."""
     fewest = 1 + 2 * unknowns
     if len(table.rows) < fewest:
         yield Finding("readings.few", "warn", {"rows": len(table.rows), "wanted": fewest}, table.label)
+    for column in (table.columns[name] for name in MEASURED_ONCE if name in table.columns and len(table.rows) > 1):
+        if column.sd and column.instrument is None and np.ptp(column.values) == 0.0:
+            facts = {"name": column.name, "sd": column.sd * column.to_display, "unit": column.unit}
+            yield Finding("readings.one_value", "warn", facts, table.label, ("mu",))
 
 
 def lint_reading_errors(table: Table[Any], rig: Rig) -> Iterable[Finding]:
@@ -383,7 +391,7 @@ def _rounded(table: Table[Any], used: slice, time: float) -> float:
 
 def _cut(table: Table[Any], used: slice, key: str, time: float) -> str:
     """The line that leaves out one side of a time of a decay; a run has no such key, and a record has a shortest length."""
-    line = f'{key} = {{ value = {_rounded(table, used, time):.10g}, unit = "s" }}'
+    line = f'{key} = {{ value = {_rounded(table, used, time):.15g}, unit = "s" }}'
     kept = np.sign(table["time"][used] - time) != (-1.0 if key == "start" else 1.0)
     possible = hasattr(table.settings, "stop") and np.count_nonzero(kept) >= SHORTEST_RECORD
     return f"Add this line to the experiment in rig.toml: {line}" if possible else "Record again."

@@ -324,16 +324,20 @@ def check_branches(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
     """Compare the branches of lines whose x rises and then falls, at equal x (t-test of their difference)."""
     findings, number = list[Finding](), 0
     for e in lines:
-        top = int(np.argmax(e.x))
-        rise, fall = np.arange(top + 1), top + 1 + np.flatnonzero(e.x[top + 1 :] >= e.x[0])
-        if min(len(rise), len(fall)) < FEWEST_OF_A_BRANCH or np.any((np.diff(e.x) > 0.0) != (np.arange(1, e.n) <= top)):
+        away = e.x - e.x[0]
+        away = away * np.sign(away[np.argmax(np.abs(away))])  # a spring that is pulled may have negative readings
+        top = int(np.argmax(away))
+        rise, fall = np.arange(top + 1), top + 1 + np.flatnonzero(away[top + 1 :] >= 0.0)
+        if min(len(rise), len(fall)) < FEWEST_OF_A_BRANCH or np.any(
+            (np.diff(away) > 0.0) != (np.arange(1, e.n) <= top)
+        ):
             continue
-        number, (x, y) = number + 1, (e.x, e.observed)
+        number, (x, y) = number + 1, (away, e.observed)
         differences = y[fall] - np.interp(x[fall], x[rise], y[rise])
         size, error = float(np.mean(differences)), float(np.std(differences, ddof=1)) / np.sqrt(len(fall))
         p = float(2.0 * stats.t.sf(abs(size) / max(error, np.finfo(float).tiny), len(fall) - 1))
         if p < LEVEL:
-            rising, falling = (float(np.polyfit(x[rows], y[rows], 1)[0]) for rows in (rise, fall))
+            rising, falling = (float(np.polyfit(e.x[rows], y[rows], 1)[0]) for rows in (rise, fall))
             column, share = e.table.columns[e.reading], abs(size) / float(np.ptp(y))
             facts = {
                 "y": e.reading,

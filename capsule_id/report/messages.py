@@ -288,6 +288,15 @@ DATA_MESSAGES: Mapping[str, Message] = {
     "readings.errors": Message(
         "reading errors", warn="no reading error is stated for {names}. Add {first}_sd to the experiment."
     ),
+    "readings.one_value": Message(
+        "reading errors",
+        warn=(
+            "{name} has one value and an sd in all rows. The fit takes that for an error of its own in each row, whose mean is "
+            "smaller, so mu is not judged. Where it was measured once, remove {name}_sd, write {name}_instrument = "
+            '"of_{name}" in its place, and add at the end of rig.toml: [[instrument]], then name = "of_{name}", then offset = '
+            '{{ value = 0, sd = {sd:.4g}, unit = "{unit}" }}. Where it was measured in each row, give its readings.'
+        ),
+    ),
     "readings.repeated_file": Message(
         "repeated readings",
         fail=(

@@ -28,6 +28,7 @@ from capsule_id.rig.schema import (
 )
 from capsule_id.rig.toml import ANY, Node, is_count, is_number, remedy_for, shown
 from capsule_id.rig.units import STAMP, UNKNOWN, UnitError, factor_to_si
+from capsule_id.views import counted
 
 # clock: Puts the times of a record on the clock of another logger: ``clock = { offset = {...}, drift = {...} }``.
 #
@@ -451,7 +452,7 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
 def _refuse_gaps(node: Node, exports: Sequence[Export], parts: Sequence["_Part"]) -> None:
     """Refuse a stated rate where the rows do not show which sample is which."""
     if len(parts) > 1:
-        raise node.error("a rate gives the times of one file", f"{len(parts)} files", "make an experiment of each")
+        raise node.error("a rate gives the times of one file", counted(len(parts), "file"), "make an experiment of each")
     for export in exports:
         gaps = np.flatnonzero(np.diff(export.lines) > 1)
         if gaps.size:

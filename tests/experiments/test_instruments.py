@@ -318,3 +318,22 @@ def test_a_channel_takes_the_clock_alone(tmp_path: Path) -> None:
         InputError, match="the instrument of x_rel of free_vibration cannot be stated, only that of time"
     ):
         cid.read_rig(folder)
+
+
+def test_an_error_of_what_was_measured_once_is_not_averaged(tmp_path: Path) -> None:
+    """Before: a board of 950 ± 19 mm gave mu ± 0.0022, trusted; that error alone moves mu by 0.009."""
+    rng = np.random.default_rng(4)
+    height = 950.0 * np.sin(np.arctan(0.4)) + 3.0 * rng.standard_normal(20)
+    rows = "".join(f"{h:.1f},950\n" for h in height)
+    (tmp_path / "t.csv").write_text(f"height [mm],length [mm]\n{rows}")
+    rig = '[rig]\nname = "r"\n[[experiment]]\nkind = "static_friction"\nfile = "t.csv"\nlength_is = "board"\n'
+    (tmp_path / "rig.toml").write_text(rig + 'length_sd = { value = 19, unit = "mm" }\n')
+    result = cid.fit(tmp_path, budget=None)
+    (found,) = [finding for finding in result.findings if finding.code == "readings.one_value"]
+    assert (found.level, found.parameters) == ("warn", ("mu",))
+    lines = r'length_instrument = "of_length"|\[\[instrument\]\]|name = "[a-z_]+"|offset = \{.*?\}'
+    key, table, name, offset = re.findall(lines, result.text(found))
+    (tmp_path / "rig.toml").write_text("\n".join([rig + key, table, name, offset]))
+    mended = cid.fit(tmp_path, budget=None)
+    assert "readings.one_value" not in {finding.code for finding in mended.findings}
+    assert mended.summary.loc["mu", "sd"] == pytest.approx(0.0093, rel=0.2)

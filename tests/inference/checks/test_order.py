@@ -248,13 +248,16 @@ def test_too_few_rows_see_no_error() -> None:
     assert (p, unseen[0]) == (1.0, np.inf)
 
 
-@pytest.mark.parametrize(("loop", "level"), [(0.0, "ok"), (0.04, "warn")])
-def test_loading_and_unloading_are_compared(tmp_path: Path, loop: float, level: str) -> None:
-    """A spring loaded and unloaded: the finding names both branches, and k2 of both holds the truth within its sd."""
+@pytest.mark.parametrize(("loop", "level", "sign"), [(0.0, "ok", 1.0), (0.04, "warn", 1.0), (0.04, "warn", -1.0)])
+def test_loading_and_unloading_are_compared(tmp_path: Path, loop: float, level: str, sign: float) -> None:
+    """A spring loaded and unloaded: the finding names both branches, and k2 of both holds the truth within its sd.
+
+    Before: those of a spring that is pulled, with negative readings, were not compared.
+    """
     up, rng = np.linspace(0.1, 2.0, 12), np.random.default_rng(1)
     x = np.concatenate([up, up[::-1][1:]])
     y = 19.0 * x - np.where(np.arange(23) < 12, 0.0, loop * 76.0 * x * (1.0 - x / 2.0)) + 0.05 * rng.standard_normal(23)
-    columns = {"deflection [mm]": x, "force [N]": y}
+    columns = {"deflection [mm]": sign * x, "force [N]": sign * y}
     entry = Entry("support_spring", "spring", columns, {"spring": '"a"'})
     result = cid.fit(make_rig(tmp_path / "loop", entry), budget=None)
     (found,) = [f for f in result.findings if f.code == "lines.branches"]
