@@ -419,8 +419,9 @@ class LogPosterior(eqx.Module):
         return xp.where(self.positive, xp.exp(xp.where(self.positive, u, 0.0)), u)
 
     def theta(self, u: np.ndarray) -> np.ndarray:
-        """(..., d) constrained values from u (..., d), NumPy."""
-        return self.constrain(u, np)
+        """(..., d) constrained values from u (..., d), NumPy; inf where a search went too far."""
+        with np.errstate(over="ignore"):
+            return self.constrain(u, np)
 
     def unconstrain(self, theta: np.ndarray) -> np.ndarray:
         """(..., d) u from constrained values (..., d), NumPy."""
