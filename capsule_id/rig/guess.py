@@ -207,10 +207,12 @@ Cells = tuple[str | None, int] | None
 Run = tuple[Cells, int, int, int]
 #: Columns of readings and of single numbers, and the errors of all others, by index.
 Readings = tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]
+#: Largest relative difference of a rate from the inverse of a stored step.
+SAME_RATE = 1e-3
 #: A number of samples a second, and words of the lines that state one.
 _RATE = re.compile(r"([0-9][0-9.,'\u2019 \u00a0\u202f]*(?:e[+-]?[0-9]+)?)\s*(k?)(?:Hz|S/s)\b", re.IGNORECASE)
 _SAMPLING = re.compile(
-    r"sampl|rate\b|abtast|messfreq|acqui|[eé]chantillon|muestreo|campion|S/s|\bf_?s\b", re.IGNORECASE
+    r"sampl|\brate\b|abtast|mess(?:rate|freq)|acqui|[eé]chantillon|muestreo|campion|S/s|\bf_?s\b", re.IGNORECASE
 )
 
 
@@ -451,22 +453,25 @@ def _headers(export: Export, dimensions: Sequence[str]) -> tuple[tuple[str, ...]
 
 
 def _rate(beginning: bytes, names: Sequence[str], units: Sequence[str], singles: dict[int, float]) -> float | None:
-    """The sampling rate that the titles of a text state, or a number with the name of a rate, Hz; None where they differ."""
-    rates = set[float | None]()
+    """The sampling rate that the titles of a text state, or a number with the name of a rate, Hz; None where several differ."""
+    rates = list[float | None]()
     for column, value in singles.items():
         name = re.split(r"[./]", names[column].lower())[-1]  # a field of a struct, an attribute of a group
         for known, si in ((RATE_NAMES, "Hz"), (STEP_NAMES, "s")):
             if name in known and value > 0.0:
                 unit = unit_of(units[column] or si, [si])
                 size = value * factor_to_si(unit, si) if unit else None
-                rates.add(size if si == "Hz" or size is None else 1.0 / size)
+                rates.append(size if si == "Hz" or size is None else 1.0 / size)
     for line in beginning.decode("utf-8", "replace").splitlines()[:_MOST_TITLES] if not rates else ():
         for found in _RATE.finditer(line) if _SAMPLING.search(line) else ():
             # 10,000 Hz may be 10 Hz.
             number = next((x for mark in ".," if (x := number_in(found[1].strip(), mark)) is not None), None)
-            unsure = re.fullmatch("[1-9][0-9]{0,2}[.,][0-9]{3}", found[1].strip())
-            rates.add(None if number is None or unsure else number * (1e3 if found[2] else 1.0))
-    return rates.pop() if len(rates) == 1 else None
+            unsure = not found[2] and re.fullmatch("[1-9][0-9]{0,2}[.,][0-9]{3}", found[1].strip())
+            # In "channel 4 100 Hz" the blank separates no thousands.
+            unsure = unsure or (" " in found[1].strip() and not re.search(r"[:=]\s*$", line[: found.start()]))
+            rates.append(None if number is None or unsure else number * (1e3 if found[2] else 1.0))
+    known = rates[0] if rates else None
+    return known if known and all(one and abs(one / known - 1.0) < SAME_RATE for one in rates) else None
 
 
 # rows: Finds what stands among readings and is none: rows of statistics, and values that stand for a missing reading.

@@ -431,13 +431,12 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
         with np.errstate(over="ignore"):
             values[name] = np.concatenate(own) * source.scale + source.offset
     where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
-    if idle := [each.path.name for part in parts for each in part.exports if each.path not in part.used]:
-        rule = "files with different headers are put side by side, and each must hold a column that is mapped"
-        raise entry["files"].error(rule, idle[0], "give all files the same headers, or make an experiment of each")
     keep, missing = _kept(node, values, where)
     for name, source in column_map.sources.items():
         if (rate := source.rate) is not None:
-            _refuse_gaps(node[name]["rate"], exports, parts)
+            if len(parts) > 1:
+                rule, remedy = "a rate gives the times of one file", "make an experiment of each"
+                raise node[name]["rate"].error(rule, counted(len(parts), "file"), remedy)
             values[name] = np.arange(first_rows[-1]) / rate
 
     # Arrays of a file may have other lengths than those that the map names.
@@ -446,20 +445,29 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
     raw = RawTable(names, units, tuple(values[name] for name in names), rows, place)
     other = int(np.sum(~keep & ~missing))
     raw = raw if keep.all() else replace(raw.taken(np.flatnonzero(keep)), lost=rows[missing], other=other)
-    return [("", raw)] if column_map.layout.split_by is None else _by_texts(entry["split_by"], parts, raw, keep)
+    split = column_map.layout.split_by is not None
+    tables = _by_texts(entry["split_by"], parts, raw, keep) if split else [("", raw)]
+    if idle := [each.path.name for part in parts for each in part.exports if each.path not in part.used]:
+        rule = "files with different headers are put side by side, and each must hold a column that is mapped"
+        raise entry["files"].error(rule, idle[0], "give all files the same headers, or make an experiment of each")
+    for _, own in tables if any(source.rate is not None for source in column_map.sources.values()) else ():
+        _refuse_gaps(own, first)
+    return tables
 
 
-def _refuse_gaps(node: Node, exports: Sequence[Export], parts: Sequence["_Part"]) -> None:
-    """Refuse a stated rate where the rows do not show which sample is which."""
-    if len(parts) > 1:
-        raise node.error("a rate gives the times of one file", counted(len(parts), "file"), "make an experiment of each")
-    for export in exports:
-        gaps = np.flatnonzero(np.diff(export.lines) > 1)
-        if gaps.size:
-            line = int(export.lines[gaps[0]]) + 1
-            rule = "a rate gives the times of rows that follow one another"
-            remedy = "write NaN there if a reading is lost, or delete the line; or export times"
-            raise InputError(rule, f"line {line} is no row", remedy, export.path, line, 1)
+def _refuse_gaps(raw: RawTable, export: Export) -> None:
+    """Refuse blank lines between some rows of a table whose times a rate gives: each may be a lost sample.
+
+    Blank lines between all rows stem from the ends of the lines.
+    """
+    behind = np.searchsorted(raw.rows, export.blanks)
+    inside = np.flatnonzero((behind > 0) & (behind < len(raw.rows)))
+    if 0 < len(np.unique(behind[inside])) < len(raw.rows) - 1:
+        rule, remedy = (
+            "a rate gives the times of rows that follow one another",
+            "write NaN there if a reading is lost, else delete it",
+        )
+        raise InputError(rule, "a blank line", remedy, export.path, int(export.blanks[inside[0]]), 1)
 
 
 def _by_texts(split_by: Node, parts: Sequence["_Part"], raw: RawTable, keep: np.ndarray) -> list[tuple[str, RawTable]]:

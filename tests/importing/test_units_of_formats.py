@@ -100,6 +100,8 @@ def test_a_rate_or_a_step_of_matlab(tmp_path: Path, name: str, value: float, str
         ("Sampling rate: 10,000 Hz", '"?"'),
         ("Low-pass filter: 200 Hz\nAbtastrate: 1000,0 Hz", "1000"),
         ("Mains filter 50 Hz", '"?"'),
+        ("Sample rate ch 4 100 Hz", '"?"'),
+        ("Sampling rate: 1.024 kHz", "1024"),
         ("Sampling rate: 1 kHz\nSampling rate of channel 2: 500 Hz", '"?"'),
     ],
 )
@@ -117,7 +119,7 @@ def test_units_and_scalars_of_a_stored_rate(tmp_path: Path, name: str, unit: str
         file["x"], file[name] = DISP, value
         file[name].attrs["unit"] = unit
     assert "rate = { value = 1000, " in entry_of(tmp_path, "a.h5", content.getvalue())
-    np.savez(tmp_path / "a.npz", x=DISP, fs=1000.0)
+    np.savez(tmp_path / "a.npz", fs=1000.0, dt=np.float32(1e-3), x=DISP)
     assert "rate = { value = 1000, " in propose_entry(tmp_path / "a.npz")
 
 

@@ -185,6 +185,21 @@ def test_a_rate_does_not_close_up_a_lost_row(tmp_path: Path) -> None:
     np.testing.assert_allclose(table["time"], np.delete(TIME, 3), rtol=1e-14)
 
 
+@pytest.mark.parametrize("lines", ["where = { tau = 1 }", "where = { tau = 2 }", 'split_by = "tau"'])
+def test_a_blank_line_between_parts_is_no_lost_row(tmp_path: Path, lines: str) -> None:
+    parts = ["".join(f"{name},{x!r}\n" for x in DISP.tolist()) for name in ("ab" if "split" in lines else "12")]
+    rig = rig_of(tmp_path, {"t.csv": "tau,x\n" + "\n".join(parts)}, f'file = "t.csv"\n{lines}\n{RATE_MAP}')
+    for table in rig.tables:
+        np.testing.assert_allclose(table["time"] - table["time"][0], TIME, atol=1e-12)
+
+
+@pytest.mark.parametrize("between", ["\n\n", "\n# a remark\n"])
+def test_blank_lines_between_all_rows_and_remarks_are_no_lost_rows(tmp_path: Path, between: str) -> None:
+    text = "x\n" + between.join(repr(x) for x in DISP.tolist()) + "\n"
+    (table,) = rig_of(tmp_path, {"t.csv": text}, f'file = "t.csv"\n{RATE_MAP}').tables
+    np.testing.assert_allclose(table["time"], TIME, rtol=1e-14)
+
+
 def test_a_rate_does_not_join_files(tmp_path: Path) -> None:
     """Before: two runs were one continuous record."""
     files: dict[str, str | bytes] = dict.fromkeys(

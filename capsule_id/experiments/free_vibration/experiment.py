@@ -114,7 +114,8 @@ def check_free_decay(decays: Sequence[Decay], fit: Fitted) -> list[Finding]:
                 force = float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, e.condensed[0]))))
             threshold = float(e.friction.force(theta).forward(0.0)) if known else None
             if threshold is None or force > threshold:
-                facts: Facts = {"force": force, "F_b": threshold, "label": e.label}
+                weight = (e.rig.mass("m1") + e.rig.mass("m2")) * e.rig.g.value
+                facts: Facts = {"force": force, "F_b": threshold, "label": e.label, "mu": force / weight}
                 sure, doubtful = free and known, ("c", *found) if known else ("k1", "c", *e.model.symbols)
                 findings.append(
                     Finding("decays.slip", "fail" if sure else "warn", facts, e.label, () if sure else doubtful)

@@ -449,10 +449,9 @@ def check_held(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
 
     A record with a stated start is not judged.
     """
-    stated = {
-        table.entry for e in records for table in e.rig.tables if getattr(table.settings, "start", None) is not None
-    }
-    judged = [e for e in records if e.table.entry not in stated]
+    tables = (table for e in records for table in e.rig.tables if getattr(table.settings, "start", None) is not None)
+    stated = {(table.entry, table.file) for table in tables}
+    judged = [e for e in records if (e.table.entry, e.table.file) not in stated]
     allowed = [_releases(e, e.local(fit.values)) for e in judged]
     matters = any(map(len, allowed))
     alone = [refit(e, e.local(fit.values), []) for e in judged] if matters else []

@@ -132,12 +132,12 @@ def _named(table: Table[Any], release: Sequence[Finding], faults: Sequence[Findi
     """The faults of a record; where another oscillation or wrong samples feign a release or a jump, those alone."""
     blamed = [found for found in (*release, *faults) if found.code not in ("readings.clipped", "readings.frozen")]
     channel, used = next(name for name in table.columns if name != "time"), window_of(table)
-    tone = other_tone(table["time"][used], table[channel][used]) if blamed else None
+    quiet = without_hum(table["time"][used], table[channel][used], table.settings.hum)
+    tone = other_tone(table["time"][used], quiet) if blamed else None
     if tone is not None:
-        open_words = None in table.settings.choices
-        if table.settings.hum is None:
-            facts = {"file": table.file, "column": channel, "tone": tone}
-            yield Finding("decays.tone", "warn" if open_words else "fail", facts, table.label)
+        open_words = None in table.settings.choices and table.settings.hum is None
+        facts = {"file": table.file, "column": channel, "tone": tone}
+        yield Finding("decays.tone", "warn" if open_words else "fail", facts, table.label)
         return
     feigned = any(found.code in ("readings.spike", "readings.dropouts", "readings.clipped") for found in faults)
     yield from (*(() if feigned else release), *faults)
@@ -241,8 +241,8 @@ def _held(table: Table[Any], rows: Iterable[Row]) -> Iterable[Finding]:
 
 #: What a release means where the capsule may move.
 EXACT_RELEASE = (
-    ", with the instant at which the rod was let go: the capsule may slip from there on, and the model begins with both at "
-    "rest, so k1 and c are not judged without it"
+    ". Put the instant at which the rod was let go in the place of this number: the capsule may slip from there on, and the "
+    "model begins with both at rest, so k1 and c are not judged without that line"
 )
 
 
@@ -252,7 +252,8 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
     earlier, settings = stop is not None and decay.end is None, table.settings
     alone = (settings.start, settings.stop, settings.releases) == (None, None, None)
     channel = next(name for name in table.columns if name != "time")
-    several = find_releases(table["time"], table[channel], channel == "x_rel") if alone and (stop or decay.rest) else []
+    values = without_hum(table["time"], table[channel], settings.hum)
+    several = find_releases(table["time"], values, channel == "x_rel") if alone and (stop or decay.rest) else []
     add = f' Or fit all of its {len(several)} releases: add releases = "all" instead.' if several else ""
     rest: Facts = {
         "file": table.file,
@@ -269,7 +270,10 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
     stated, doubtful = table.settings.start is not None, ()
     if settings.forward == "capsule" and not stated:
         # The capsule moves soon after the release, and the model begins with a capsule at rest.
-        rest |= {"start": round(decay.start - MARGIN * decay.period, digits), "longer": EXACT_RELEASE}
+        rest |= {
+            "start": round(decay.start - MARGIN * decay.period * (not decay.pushed), digits),
+            "longer": EXACT_RELEASE,
+        }
         doubtful = ("k1", "c")
     rows: tuple[Row, ...] = (
         (decay.rest > 0.0 and not earlier, "decays.release", "fail" if stated else "warn", rest, doubtful),
@@ -574,7 +578,8 @@ def _slip(facts: Facts) -> str:
     if facts["F_b"] is None:
         text = (
             "{label}: the rod pushes with {force:.3g} N, and no experiment tells whether friction then holds a free capsule, "
-            "so these numbers are not judged. Add a test of static friction, or hold the capsule and remove capsule."
+            "so these numbers are not judged (a coefficient of {mu:.2g} or more holds it). Add a test of static friction, or "
+            'hold the capsule and remove capsule = "free".'
         )
     return filled_in(text, facts)
 

@@ -418,7 +418,8 @@ def divide_at_releases(entry: Node, columns: Mapping[str, np.ndarray], settings:
         if key in entry:
             rule = f"releases finds each decay of a record by itself, and takes no {key}"
             raise entry[key].error(rule, "both", f"remove {key}, or releases", of_key=True)
-    found = find_releases(columns["time"], columns[channel], channel == "x_rel")
+    values = without_hum(columns["time"], columns[channel], settings.hum)
+    found = find_releases(columns["time"], values, channel == "x_rel")
     if not found:
         rule, remedy = "releases needs a record of several releases", "remove releases: one decay is found without it"
         raise entry["releases"].error(rule, "fewer than two found", remedy)

@@ -189,8 +189,8 @@ def _read_data_sets(content: bytes, path: Path) -> Iterator[tuple[str, np.ndarra
                 continue
             readings += found.size
             refuse_large(READING * readings, content, path)
-            array, unit = _unpacked(np.atleast_1d(_written(found)), found.attrs), unit_stated(found.attrs)
-            yield name, np.ascontiguousarray(array.T if by_columns else array), unit
+            array, unit = np.asarray(_unpacked(_written(found), found.attrs)), unit_stated(found.attrs)
+            yield name, np.asarray(array.T if by_columns else array, order="C"), unit
         objects: Any = [("", file), *((k, file[k]) for k, link in links.items() if isinstance(link, h5py.HardLink))]
         for name, found in objects:
             for key in (key for key in found.attrs if key.lower() in RATE_NAMES):  # a rate that an attribute states
@@ -330,7 +330,7 @@ def _numbers(content: bytes) -> np.ndarray | None:
     if prod(shape) * dtype.itemsize != len(content) - stream.tell():
         raise ValueError(f"an array of {shape} in {len(content)} bytes")
     stream.seek(0)
-    return np.atleast_1d(np.lib.format.read_array(stream, allow_pickle=False))
+    return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 read_npz = partial(_read_arrays, _members, "write it again by numpy.savez", "")
@@ -546,9 +546,13 @@ def _rows(sheet: Any, path: Path) -> tuple[list[list[str]], bool]:
     return rows, numbers
 
 
+#: Characters of a number format that are shown as they are.
+_LITERAL = re.compile(r'"[^"]*"|\\.')
+
+
 def _written_number(cell: Any) -> str:
     """The number of a cell as text, as the sheet shows it where that is per cent: 0.2 as 20%."""
-    return f"{100.0 * cell.value:.15g}%" if "%" in cell.number_format else repr(float(cell.value))
+    return f"{100.0 * cell.value:.15g}%" if "%" in _LITERAL.sub("", cell.number_format) else repr(float(cell.value))
 
 
 def _in_sheet(error: InputError, lines: list[str], more: str = "") -> InputError:

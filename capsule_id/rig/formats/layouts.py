@@ -97,7 +97,18 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     def every() -> Iterator[list[str]]:
         return (split_bare(line, delimiter) for line in filter(is_row, file.lines(first)))
 
-    return Export(path, headers, width, lines, rows.column, place, file.encoding, cells=every, marks=rows.marks)
+    return Export(
+        path,
+        headers,
+        width,
+        lines,
+        rows.column,
+        place,
+        file.encoding,
+        cells=every,
+        marks=rows.marks,
+        blanks=rows.blanks,
+    )
 
 
 def _file(content: bytes, path: Path, layout: Layout) -> TextFile:
@@ -116,6 +127,10 @@ def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[s
     return column + 1 in wanted or any(names[column] in wanted for names in headers)
 
 
+#: What may stand behind a number that is no number alone.
+PER_CENT = " %"
+
+
 def _head(file: TextFile, layout: Layout) -> list[str]:
     """The lines up to the first row of numbers, that row included.
 
@@ -130,7 +145,9 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
     if stated is not None:
         begun = next((k for k, line in rows if k + 1 >= stated and line.strip()), None)
     else:
-        begun = next((k for k, line in rows if any(map(is_number, _cells(line, layout)))), None)
+        begun = next(
+            (k for k, line in rows if any(is_number(cell.rstrip(PER_CENT)) for cell in _cells(line, layout))), None
+        )
     if begun is None:
         raise InputError(
             f"a table must have rows of numbers, the first one in the first {MOST_TITLES} lines",
@@ -249,7 +266,7 @@ def is_number(cell: str) -> bool:
 
 def _is_reading(cell: str, layout: Layout) -> bool:
     """Whether a cell is a number, with a sign of per cent or not, a time stamp, or a stated missing marker."""
-    return is_number(cell.removesuffix("%")) or cell in layout.missing or is_stamp(cell)
+    return is_number(cell.rstrip(PER_CENT)) or cell in layout.missing or is_stamp(cell)
 
 
 # csv: Reads CSV tables: a header ``name [unit]`` per column, then rows of numbers as any text export has them.

@@ -5,7 +5,7 @@ import gzip
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -373,6 +373,7 @@ class Export:
     sheet, others : names of the sheet of a workbook that was read, "" of another format, and of others with numbers
     cells : the texts of each row of a text or a sheet, read or not; None: the format has no such rows
     marks : decimal marks of the columns of a text, where their numbers show them
+    blanks : 1-based blank lines of a text or a sheet
     """
 
     path: Path
@@ -386,6 +387,7 @@ class Export:
     others: tuple[str, ...] = ()
     cells: Callable[[], Iterable[list[str]]] | None = None
     marks: Mapping[int, str | None] = field(default_factory=dict)
+    blanks: Sequence[int] = ()
 
 
 # arrays: Makes an export of named arrays: the form of every format without lines.
@@ -431,8 +433,9 @@ def export_of_arrays(arrays: Mapping[str, np.ndarray], path: Path, layout: Layou
     """
     refuse_line(layout, path)
     columns, stated, widest = {}, [], 0
-    for name, array in arrays.items():
-        if array.size and name.isprintable() and array.ndim in (1, 2):
+    # Scalars come last: columns may be named by their numbers.
+    for name, array in sorted(arrays.items(), key=lambda item: item[1].ndim == 0):
+        if array.size and name.isprintable() and array.ndim <= 2:
             own = {name: array.ravel()}
             if array.ndim == 2 and 1 not in array.shape:
                 if min(array.shape) > MOST_SERIES:  # an image, or a covariance: no series of readings

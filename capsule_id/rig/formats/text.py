@@ -288,6 +288,8 @@ class Rows:
     marks: dict[int, str | None]
     faults: dict[int, InputError] = field(default_factory=dict)
     blocks: list[np.ndarray] = field(default_factory=list)
+    #: Blank lines, counted from 1.
+    blanks: list[int] = field(default_factory=list)
 
     @property
     def lines(self) -> np.ndarray:
@@ -364,8 +366,9 @@ def rows_of(file: TextFile, shape: Shape, columns: Sequence[int], missing: Seque
         plain = not codes and not apart and len(known) < 2 and (known or b"." not in block)
         of_block = replace(shape, decimal=max(known, default="."))
         values = plain_block(block, of_block, columns) if plain else None
-        every = enumerate(lines_of(block) if values is None else (), number)
+        every = [*enumerate(lines_of(block) if values is None else (), number)]
         kept = [(line, row) for line, row in every if is_row(row)]
+        rows.blanks.extend(line + 1 for line, row in every if not row.strip(_NO_CELLS))
         if values is None and plain and len(kept) < block.count(b"\n"):  # blank lines or comments
             values = plain_block("\n".join([*(text for _, text in kept), ""]).encode(), of_block, columns)
         lines = [line for line, _ in kept] if kept or values is None else np.arange(number, number + len(values))
