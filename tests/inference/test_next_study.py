@@ -13,7 +13,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.point_test import PointTest
-from capsule_id.inference.planning import MOST_ROWS, Candidate, lines_of
+from capsule_id.inference.planning import MOST_ROWS, Candidate, _candidates_of, lines_of
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import symbol_of
 from capsule_id.synthetic import PAPER, Truth, synthesize
@@ -57,6 +57,8 @@ def trials(one: Candidate, truth: dict[str, float], number: int, rng: np.random.
     true = {**e.readings, e.reading: e.shown(theta, e.readings)}
     sds = {name: e.sds[name] for name in e.uncertain} | {e.reading: error}
     read = {name: x + sds.get(name, 0.0) * rng.standard_normal(e.n) for name, x in true.items()}
+    # Nobody writes down a distance below 0.
+    read = {name: np.where(np.asarray(true[name]) > 0.0, np.abs(x), x) for name, x in read.items()}
     kept = np.linspace(0, e.n - 1, number).round().astype(int)
     return [pd.DataFrame({f"{c.name} [{c.unit}]": (read[c.name] * c.to_display)[kept] for c in columns})]
 
@@ -113,20 +115,21 @@ def sds(folder: Path, targets: Sequence[str]) -> np.ndarray:
 
 
 def outcome_of(folder: Path, number: int, most_random: int) -> Outcome:
-    """One twin: sampled, planned, measured further by the best row of ``next`` and by random rows of one kind."""
+    """One twin: sampled, planned, measured further by the best row of ``next`` and by random tests of the same time."""
     rng, targets = np.random.default_rng(1000 + number), TARGETS[number % len(TARGETS)]
     free = [name for name in PAPER if name not in ("g", "m1", "m2")]
     drawn = {name: PAPER[name] * float(np.exp(0.1 * rng.standard_normal())) for name in free}
     truth = synthesize(folder, 100 + number, Truth({**PAPER, **drawn}))
-    plan = cid.fit(folder, ess=400, seed=number).next_tests(targets, minutes=MINUTES)
+    result = cid.fit(folder, ess=400, seed=number)
+    plan, every = result.next_tests(targets, minutes=MINUTES), _candidates_of(result, MINUTES, 0)[1]
     today, ratios = sds(folder, targets), plan.table[[f"{name}, ratio" for name in targets]].to_numpy(float)
 
     def left(members: Sequence[Candidate]) -> float:
         return float(np.exp(np.mean(np.log(sds_with(folder, members, truth, rng, targets) / today))))
 
-    # A table of more rows would stand for more trials than it has.
-    others = [row for row in plan.options[1:] if len(row) == 1 and row[0].tests <= MOST_ROWS]
-    chosen = [others[i] for i in rng.permutation(len(others))[:most_random]]
+    # A template of many trials stands for more than it has rows. The best one is no random one.
+    others = [one for one in every if one.tests <= MOST_ROWS and one.words != plan.table["what"].iloc[0]]
+    chosen = [(others[i],) for i in rng.permutation(len(others))[:most_random]]
     return Outcome(float(np.exp(np.mean(np.log(ratios[0])))), left(plan.options[0]), [left(row) for row in chosen])
 
 
