@@ -284,7 +284,7 @@ def friction_of(rig: Rig, law: type[FrictionLaw] | None = None, contact: type[Fo
     free = tuple(symbol for symbol in rig.model.free if symbol in OF_FRICTION)
     if law is None:
         return FrictionModel(free=free, constant=rig.model.friction == "constant", contact=contact)
-    if free or rig.model.friction != ModelChoices().friction:
+    if free or rig.model.friction != DEFAULT_CHOICES.friction:
         raise InputError(
             "a friction law of its own replaces [model]",
             f"both {law.__name__} and [model]",

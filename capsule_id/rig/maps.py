@@ -432,12 +432,8 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
             values[name] = np.concatenate(own) * source.scale + source.offset
     where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
     keep, missing = _kept(node, values, where)
-    for name, source in column_map.sources.items():
-        if (rate := source.rate) is not None:
-            if len(parts) > 1:
-                rule, remedy = "a rate gives the times of one file", "make an experiment of each"
-                raise node[name]["rate"].error(rule, counted(len(parts), "file"), remedy)
-            values[name] = np.arange(first_rows[-1]) / rate
+    rates = {name: source.rate for name, source in column_map.sources.items() if source.rate is not None}
+    values |= {name: np.arange(first_rows[-1]) / rate for name, rate in rates.items()}
 
     # Arrays of a file may have other lengths than those that the map names.
     rows = np.arange(1, 1 + int(first_rows[-1])) if len(parts) > 1 else first.lines[: int(first_rows[-1])]
@@ -447,27 +443,32 @@ def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> 
     raw = raw if keep.all() else replace(raw.taken(np.flatnonzero(keep)), lost=rows[missing], other=other)
     split = column_map.layout.split_by is not None
     tables = _by_texts(entry["split_by"], parts, raw, keep) if split else [("", raw)]
-    if idle := [each.path.name for part in parts for each in part.exports if each.path not in part.used]:
-        rule = "files with different headers are put side by side, and each must hold a column that is mapped"
-        raise entry["files"].error(rule, idle[0], "give all files the same headers, or make an experiment of each")
-    for _, own in tables if any(source.rate is not None for source in column_map.sources.values()) else ():
-        _refuse_gaps(own, first)
+    _refuse_lost(entry, parts, tables, list(rates))
     return tables
 
 
-def _refuse_gaps(raw: RawTable, export: Export) -> None:
-    """Refuse blank lines between some rows of a table whose times a rate gives: each may be a lost sample.
+def _refuse_lost(
+    entry: Node, parts: Sequence["_Part"], tables: Sequence[tuple[str, RawTable]], rates: Sequence[str]
+) -> None:
+    """Refuse a file of which no column is used, and ``rates`` where rows do not show which sample they are.
 
-    Blank lines between all rows stem from the ends of the lines.
+    Each blank line between some rows of a table may be a lost sample; between all rows they stem from the ends of the lines.
     """
-    behind = np.searchsorted(raw.rows, export.blanks)
-    inside = np.flatnonzero((behind > 0) & (behind < len(raw.rows)))
-    if 0 < len(np.unique(behind[inside])) < len(raw.rows) - 1:
-        rule, remedy = (
-            "a rate gives the times of rows that follow one another",
-            "write NaN there if a reading is lost, else delete it",
-        )
-        raise InputError(rule, "a blank line", remedy, export.path, int(export.blanks[inside[0]]), 1)
+    exports = [each for part in parts for each in part.exports]
+    used = set[Path]().union(*(part.used for part in parts))
+    if idle := [each.path.name for each in exports if each.path not in used]:
+        rule = "files with different headers are put side by side, and each must hold a column that is mapped"
+        raise entry["files"].error(rule, idle[0], "give all files the same headers, or make an experiment of each")
+    if rates and len(parts) > 1:
+        rule, remedy = "a rate gives the times of one file", "make an experiment of each"
+        raise entry["columns"][rates[0]]["rate"].error(rule, counted(len(parts), "file"), remedy)
+    for _, raw in tables if rates else ():
+        behind = np.searchsorted(raw.rows, exports[0].blanks)
+        inside = np.flatnonzero((behind > 0) & (behind < len(raw.rows)))
+        if 0 < len(np.unique(behind[inside])) < len(raw.rows) - 1:
+            rule = "a rate gives the times of rows that follow one another"
+            remedy = "write NaN there if a reading is lost, else delete the line"
+            raise InputError(rule, "a blank line", remedy, exports[0].path, int(exports[0].blanks[inside[0]]), 1)
 
 
 def _by_texts(split_by: Node, parts: Sequence["_Part"], raw: RawTable, keep: np.ndarray) -> list[tuple[str, RawTable]]:
