@@ -125,6 +125,32 @@ def bulk_and_tail_size(draws: Draws) -> Float[np.ndarray, "2 d"]:
     return np.stack([bulk, np.min(ends, axis=0)])
 
 
+def geyer_size(draws: Draws) -> Float[np.ndarray, " d"]:
+    """(d,) effective sample sizes of the means, every walker a chain, as ArviZ has them (Vehtari et al. 2021, section 3).
+
+    The sum of autocorrelations ends before the first negative pair of lags, and no pair counts more than one before it.
+    """
+    half = draws.shape[1] // 2
+    draws = in_range(draws)
+    halves = np.concatenate([draws[:, :half], draws[:, draws.shape[1] - half :]])
+    chains = np.moveaxis(halves, 1, 2).reshape(-1, half, draws.shape[-1])
+    means = np.mean(chains, axis=1, keepdims=True)
+    spectrum = np.abs(np.fft.rfft(chains - means, n=2 * half, axis=1)) ** 2
+    covariance = np.mean(np.fft.irfft(spectrum, n=2 * half, axis=1)[:, :half], axis=0) / half
+    within = covariance[0] * half / max(half - 1, 1)
+    rho = 1.0 - (within - covariance) / (covariance[0] + np.var(means[:, 0], axis=0, ddof=1))
+    rho[0] = 1.0
+    times = []
+    for own in rho.T:
+        used = own[: max(half - 1, 2)]
+        pairs = used[:-1:2] + used[1::2]
+        last = int(np.argmax(np.append(pairs[:-1] < 0.0, True)))
+        least = 0.0 if np.any(pairs[last : last + 1] < 0.0) else -1.0
+        times.append(2.0 * np.sum(np.minimum.accumulate(pairs[:last])) - 1.0 + max(own[2 * last], least))
+    number = chains.shape[0] * half
+    return number / np.maximum(times, 1.0 / np.log10(number))
+
+
 # moves: Ensemble moves.
 
 

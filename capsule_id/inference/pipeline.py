@@ -183,7 +183,7 @@ def make_result(
     pointwise, findings = None, tuple(checked.findings)
     if posterior is not None:
         pointwise = _pointwise(target, posterior, rng)
-        findings = (*findings, decisive_readings(pointwise, float(np.mean(posterior.ess))))
+        findings = (*findings, decisive_readings(pointwise, posterior.draws))
     views = (e.record_view(e.local(checked.values)) for e in target.experiments if panels)
     return kind(
         rig=target.rig,

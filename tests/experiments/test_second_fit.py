@@ -136,7 +136,7 @@ def test_a_record_with_two_excitations_keeps_its_model(monkeypatch: pytest.Monke
     monkeypatch.setattr("capsule_id.experiments.free_vibration.second_fit.LONGEST_UNCUT", 100)
     (thinned,), (finding,) = second_models([uncut], readings)
     assert (thinned.model, thinned.replaced) == (DecayModel(thin=5), False)
-    assert "means of 5 samples" in MESSAGES["decays.first_fit"].text("warn", finding.facts)
+    assert "holds 5 samples" in MESSAGES["decays.first_fit"].text("warn", finding.facts)
     (again,) = [found for found in readings if found.code == "decays.second"]
     cut = bench.table("free_vibration", columns, "decay", stop=again.facts["stop"])
     record_cut = FreeVibration(cut, bench.rig(cut))

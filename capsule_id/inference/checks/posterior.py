@@ -13,6 +13,7 @@ from capsule_id.experiments.lint import wrong_prefix
 from capsule_id.experiments.statistics import basis_of
 from capsule_id.inference.checks.settings import SMALLEST_SCATTER, design
 from capsule_id.inference.least_squares import linearised
+from capsule_id.inference.moves import geyer_size
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.prediction import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.result import PointFit, Pointwise, Posterior
@@ -471,13 +472,13 @@ def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding
     return findings or [Finding("residuals.statistics", "ok", {"number": len(judged)})] * bool(judged)
 
 
-def decisive_readings(pointwise: Pointwise, size: float) -> Finding:
+def decisive_readings(pointwise: Pointwise, draws: np.ndarray) -> Finding:
     """Name the readings without which the sample cannot predict them, because they decide a parameter.
 
     The shape of a term is the larger one of two tails, whose lengths are those for independent weights, and for weights
-    of a sample with the effective ``size``.
+    of a sample ``draws`` (ensemble, draw, walker, d) with its effective size, as ArviZ has it.
     """
-    named, number = list[tuple[float, str, int]](), 0
+    size, named, number = float(np.mean(geyer_size(draws))), list[tuple[float, str, int]](), 0
     for label, density in pointwise.log_likelihood.items():
         terms = density.reshape(-1, density.shape[-1]).T
         number += len(terms)

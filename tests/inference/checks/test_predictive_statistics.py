@@ -180,7 +180,7 @@ def test_a_reading_is_decisive_by_the_shorter_tail_of_a_sample_with_many_draws()
     density = -np.log(rng.permutation(weights)).reshape(100, 10, 1)
     pointwise = Pointwise({"slides": density}, {"slides": np.array([4])}, {}, np.arange(100), np.arange(10), 1)
     named = []
-    for size in (8000.0, 1000.0):  # eight times and once the number of weights
-        found = decisive_readings(pointwise, size)
+    for draws in (200, 25):  # effective sizes of about eight times and of once the number of weights
+        found = decisive_readings(pointwise, rng.standard_normal((4, draws, 10, 2)))
         named.append(found.facts["rows"])
     assert named == ["slides reading 5 (1.04)", ""]

@@ -11,6 +11,7 @@ from capsule_id.inference.moves import (
     bulk_and_tail_size,
     effective_sample_size,
     ensemble_time,
+    geyer_size,
     integrated_time,
     pooled_time,
     split_rhat,
@@ -80,7 +81,7 @@ def test_diagnostics_of_huge_draws_are_those_of_small_ones() -> None:
     """Draws up to 1e150 of a parameter that no reading bounds. (Before: an overflow.)"""
     x = autoregressive(0.5, (2, 100, 8, 2), 10)
     huge = np.ldexp(x, (520, -520))
-    for of in (split_rhat, integrated_time):
+    for of in (split_rhat, integrated_time, geyer_size):
         np.testing.assert_array_equal(of(huge), of(x))
 
 
