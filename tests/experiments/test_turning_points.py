@@ -12,6 +12,8 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.experiment import later_start
+from capsule_id.experiments.free_vibration.hidden_terms import check_held
 from capsule_id.experiments.free_vibration.turning_points import TurningPoints, fitted, screened
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.lint import lint
@@ -384,3 +386,43 @@ def test_channels_have_different_names() -> None:
     tables += [bench.table("free_vibration", [bench.column("time", time), both[0]], "a_velocity")]
     with pytest.raises(InputError, match="different names"):
         make_experiments(bench.rig(*tables))
+
+
+def _held(columns: int = 1) -> list[Column]:
+    """A rod that is held for 0.2 s at 2 mm and let go: x_rel, and the velocity as a second column."""
+    rng, t = np.random.default_rng(0), np.arange(600) / 1000.0
+    x = np.append(np.full(200, 2e-3), bench.released(t, 2e-3))
+    both = {"x_rel": x + 2e-6 * rng.standard_normal(800), "velocity": np.gradient(x, 1e-3)}
+    return [bench.column("time", np.arange(800) / 1000.0), *(bench.column(*one) for one in [*both.items()][:columns])]
+
+
+@pytest.mark.parametrize(("forward", "doubted"), [("closed", ()), ("capsule", ("k1", "c"))])
+def test_the_capsule_model_needs_the_instant_of_the_release(forward: str, doubted: tuple[str, ...]) -> None:
+    """Before: the record began with a capsule that moved already, and c was 1.5 sd off, trusted."""
+    rig = bench.rig(bench.table("free_vibration", _held(), capsule="free", forward=forward))
+    (found,) = [f for f in lint(rig, default_registry(), rig.tables) if f.code == "decays.release"]
+    assert found.parameters == doubted
+    assert (found.facts["start"] <= 0.2) is bool(doubted)
+
+
+def test_lines_that_releases_refuses_are_not_printed() -> None:
+    """``releases`` takes no start."""
+    table = bench.table("free_vibration", _held())
+    starts = []
+    for releases in (None, "all"):
+        own = replace(table, settings=replace(table.settings, releases=releases, start=0.21))
+        (e,) = make_experiments(bench.rig(own))
+        starts.append(later_start(cast(Any, e))["start"])
+    assert starts[0] is not None
+    assert starts[1] is None
+
+
+def test_a_stated_start_holds_for_all_channels_of_a_file() -> None:
+    """Before: the second channel was judged, and the line to add was there already."""
+    for start, codes in ((None, {"decays.held"}), (0.21, set())):
+        rig = bench.rig(bench.table("free_vibration", _held(2), "a", start=start))
+        records = cast(Any, make_experiments(rig))
+        values = {"k1": bench.K1, "c": bench.C, "m1": bench.M1}
+        values |= {row.name: 2e-6 for e in records for row in e.parameters if row.name not in values}
+        fit = cast(Any, SimpleNamespace(values=values))
+        assert {finding.code for finding in check_held(records, fit)} == codes

@@ -13,6 +13,8 @@ from pyarrow import parquet
 from scipy.io import savemat
 
 from capsule_id.importing import propose_entry
+from capsule_id.rig.formats import EXPORTS
+from capsule_id.rig.formats.raw import Layout
 from tests.rig.formats.writers import lvm
 
 TIME = np.arange(1500) * 1e-3
@@ -134,7 +136,7 @@ def test_a_symbol_over_its_unit(tmp_path: Path) -> None:
 def test_sheets_named_in_other_letters_and_cells_of_per_cent(tmp_path: Path) -> None:
     """Before: two entries of one label, and 20 % read as 0.2 %."""
     book = openpyxl.Workbook()
-    for sheet in (book.active, book.create_sheet("Жёсткая")):
+    for sheet in (book.worksheets[0], book.create_sheet("Жёсткая")):
         sheet.append(["duty [%]", "F [N]"])
         for k in range(2, 9):
             sheet.append([k / 10, 2.0 * k])
@@ -145,6 +147,29 @@ def test_sheets_named_in_other_letters_and_cells_of_per_cent(tmp_path: Path) -> 
     assert 'label = "a_1"' in entry
     assert 'label = "a_2"' in entry
     assert "'duty [%]' is not read: line 2 has '20%'" in entry
+
+
+def test_a_sign_of_per_cent_that_a_format_only_shows(tmp_path: Path) -> None:
+    """``0.00"%"`` scales nothing."""
+    book = openpyxl.Workbook()
+    sheet = book.worksheets[0]
+    sheet.append(["duty [%]", "F [N]"])
+    for k in range(2, 9):
+        sheet.append([10.0 * k, 2.0 * k])
+        sheet.cell(k, 1).number_format = '0.00"%"'
+    book.save(tmp_path / "a.xlsx")
+    assert "20%" not in propose_entry(tmp_path / "a.xlsx")
+    assert np.array_equal(
+        EXPORTS[".xlsx"]((tmp_path / "a.xlsx").read_bytes(), tmp_path / "a.xlsx", Layout(columns=(1,))).values(0),
+        10.0 * np.arange(2, 9),
+    )
+
+
+def test_scalars_do_not_move_columns_named_by_number(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", fs=1000.0, t=TIME, x=DISP)
+    export = EXPORTS[".npz"]((tmp_path / "a.npz").read_bytes(), tmp_path / "a.npz", Layout(columns=(1, 2)))
+    assert export.headers[0] == ("t", "x", "fs")
+    np.testing.assert_array_equal(export.values(1), DISP)
 
 
 def test_columns_that_are_not_used_are_named(tmp_path: Path) -> None:
