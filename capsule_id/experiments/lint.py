@@ -22,7 +22,7 @@ from capsule_id.records.faults import (
 )
 from capsule_id.records.release import find_free_decay
 from capsule_id.records.tones import frequency_of
-from capsule_id.rig.filters import TIMING_TOLERANCE, hampel_outliers, largest_offset, median_step
+from capsule_id.rig.filters import TIMING_TOLERANCE, hampel_outliers, largest_offset, median_step, rounded
 from capsule_id.rig.formats.raw import WINDOWS
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import RIG_QUANTITIES, SHORTEST_RECORD, ColumnRule, GroundSettings, QuantityRule
@@ -384,14 +384,9 @@ KEPT_PERIODS = 3
 MOST_SPIKES, WINDOW, LIMITS = 20, 10, (20.0, 12.0, 8.0, 5.0)
 
 
-def _rounded(table: Table[Any], used: slice, time: float) -> float:
-    """A time with one digit more than the sampling step needs."""
-    return float(np.round(time, max(0, int(np.ceil(-np.log10(median_step(table["time"][used]))))) + 1))
-
-
 def _cut(table: Table[Any], used: slice, key: str, time: float) -> str:
     """The line that leaves out one side of a time of a decay; a run has no such key, and a record has a shortest length."""
-    line = f'{key} = {{ value = {_rounded(table, used, time):.15g}, unit = "s" }}'
+    line = f'{key} = {{ value = {rounded(time, table["time"][used], 1):.15g}, unit = "s" }}'
     kept = np.sign(table["time"][used] - time) != (-1.0 if key == "start" else 1.0)
     possible = hasattr(table.settings, "stop") and np.count_nonzero(kept) >= SHORTEST_RECORD
     return f"Add this line to the experiment in rig.toml: {line}" if possible else "Record again."
@@ -490,7 +485,7 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
             "begin": begin,
             "end": end,
             "key": key,
-            "value": _rounded(table, used, cut),
+            "value": rounded(cut, table["time"][used], 1),
             "cut": _cut(table, used, key, cut),
         }
         yield _fault(table, "readings.burst", np.array([first, last - 1]), "fail", **facts)

@@ -98,6 +98,11 @@ def median_step(time: Record) -> float:
     return float(np.median(np.diff(time)))
 
 
+def rounded(instant: float, time: Record, more: int = 0) -> float:
+    """An instant with as many digits, s, as the steps of the times have, and ``more``."""
+    return float(np.round(instant, max(0, int(np.ceil(-np.log10(median_step(time))))) + more))
+
+
 def largest_offset(time: Record, step: float) -> float:
     """Largest distance of the times from an even grid with ``step`` that begins at the first one, s."""
     return float(np.max(np.abs(time - time[0] - step * np.arange(len(time)))))

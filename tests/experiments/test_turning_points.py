@@ -413,8 +413,7 @@ def test_lines_that_releases_refuses_are_not_printed() -> None:
         own = replace(table, settings=replace(table.settings, releases=releases, start=0.21))
         (e,) = make_experiments(bench.rig(own))
         starts.append(later_start(cast(Any, e))["start"])
-    assert starts[0] is not None
-    assert starts[1] is None
+    assert starts == [0.262, None]  # behind half of the largest amplitude
 
 
 def test_a_stated_start_holds_for_all_channels_of_a_file() -> None:

@@ -28,7 +28,7 @@ from capsule_id.parameters import parameter
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import sampling
 from capsule_id.records.tones import SIGNIFICANT, VISIBLE, length_of_motion, other_tone
-from capsule_id.rig.filters import median_step
+from capsule_id.rig.filters import median_step, rounded
 from capsule_id.views import Facts, Finding, Level, ResultTable, listed
 
 #: Rounding errors are no noise where all noise is below this share of the distance of levels; rounding alone is 0.29 of it.
@@ -266,11 +266,6 @@ def later_start(e: DecayRecord) -> Facts:
     if few or e.rough.c * e.rough.Omega_o > e.rough.k1 or e.table.settings.releases:
         return {"start": None}
     return {"start": rounded(decay_window(e.table)[0][0] + e.time[begin], e.time)}
-
-
-def rounded(instant: float, time: np.ndarray) -> float:
-    """An instant with as many digits, s, as the steps of the times (n,) have."""
-    return float(np.round(instant, max(0, int(np.ceil(-np.log10(median_step(time)))))))
 
 
 def fast_rms(time: np.ndarray, values: np.ndarray, half: float) -> float | None:
