@@ -479,34 +479,8 @@ def correlated_records(experiments: Sequence["Experiment"], values: Mapping[str,
 UNFIT = 1e9
 
 
-@dataclass(frozen=True)
-class Refit:
-    """Estimates of the physical parameters of one experiment.
-
-    Attributes
-    ----------
-    pairs : estimate and its standard error where the variance of the readings is that of the point fit, by symbol, SI
-    scale : variance of the readings over that of the point fit, from the misfit; 1 where it is known
-    freedom : degrees of freedom of ``scale``
-    """
-
-    pairs: Mapping[str, tuple[float, float]]
-    scale: float
-    freedom: int
-
-    def scaled(self, scale: float) -> dict[str, tuple[float, float]]:
-        """Estimates, and their standard errors with ``scale``."""
-        return {symbol: (value, float(np.sqrt(scale)) * sd) for symbol, (value, sd) in self.pairs.items()}
-
-
 def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """Estimate and standard error of the experiment's physical parameters without some readings, SI; see ``estimate``."""
-    found = estimate(experiment, theta, left_out)
-    return found.scaled(found.scale)
-
-
-def estimate(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]) -> Refit:
-    """Estimate the experiment's physical parameters without some readings.
+    """Estimate and standard error of the experiment's physical parameters without some readings, SI, by symbol.
 
     Parameters that rig.toml states stay at the point fit: one experiment alone may not determine them. Scatters stay
     there too when nothing is left out, and are rescaled by the remaining misfit otherwise.
@@ -550,9 +524,6 @@ def estimate(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[i
     values = values_of(solution.x)
     # Rounding may leave a variance of no positive value, where two parameters have the same effect.
     sd = np.sqrt(np.where(variances > 0.0, variances, np.inf)) / unit
-    errors = np.where(np.isfinite(sd), np.abs(at if signed else values), 1.0) * sd
-    return Refit(
-        {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)},
-        1.0 if experiment.scale_known else float(2.0 * solution.cost / freedom),
-        freedom,
-    )
+    scale = 1.0 if experiment.scale_known else np.sqrt(2.0 * solution.cost / freedom)
+    errors = scale * np.where(np.isfinite(sd), np.abs(at if signed else values), 1.0) * sd
+    return {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)}

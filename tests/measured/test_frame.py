@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from capsule_id.experiments.forced_run.drives import BaseRun
 from capsule_id.experiments.friction_model import FrictionModel
-from capsule_id.inference.checks.verdict import record_widenings
+from capsule_id.inference.checks.verdict import widenings
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
@@ -91,7 +91,7 @@ def test_the_stiffness_of_the_frame_is_within_its_widened_interval(tmp_path: Pat
     index = [found.target.names[i] for i in found.target.located].index("k1")
     jacobian = plain_jacobian(found.target, found.fit.u)
     sd = found.values["k1"] * float(np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[index, index]))
-    wide = record_widenings(found)["k1"]
+    wide = widenings(found)["k1"]
     assert wide.factor > 3.0
     assert abs(found.values["k1"] - 1191.0) < 0.03 * 1191.0
     assert abs(found.values["k1"] - 1191.0) < 2.0 * sd * wide.factor

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy import optimize, stats
 
-from capsule_id.experiments.base import Experiment, ValuesBySymbol, estimate, refit
+from capsule_id.experiments.base import Experiment, ValuesBySymbol, refit
 from capsule_id.experiments.friction import varies
 from capsule_id.experiments.statistics import autocorrelation, basis_of, judged, of_neighbours, permutation_p
 from capsule_id.inference.curvature import jacobian
@@ -186,20 +186,19 @@ def _tables_by_slope(s: SampledFit) -> Groups:
 
     The test is that of Alexander and Govern (1994): each table has its own scatter and degrees of freedom.
     """
-    alike: dict[tuple[str, ...], list[Experiment]] = {}
+    alike: dict[tuple[str, ...], list[tuple[Experiment, float]]] = {}
     for e in s.experiments:
         own = [row.name for row in e.parameters if row.physical and not is_stated(row.name)]
         nuisances = e.misfit(e.local(s.values)).design.shape[1]
         # Two rows of a line show nothing of their scatter.
-        enough = e.scale_known or e.n - len(s.flagged.get(e.label, [])) > len(own) + nuisances
-        if e.bench and not e.time_series and own and nuisances and enough:
-            alike.setdefault((e.kind, *own), []).append(e)
+        freedom = np.inf if e.scale_known else e.n - len(s.flagged.get(e.label, [])) - len(own) - nuisances
+        if e.bench and not e.time_series and own and nuisances and freedom > 0:
+            alike.setdefault((e.kind, *own), []).append((e, freedom))
     groups = []
-    for members in (members for members in alike.values() if len(members) > 1):
+    for members, freedom in (zip(*pairs, strict=True) for pairs in alike.values() if len(pairs) > 1):
         symbol = next(row.symbol for row in members[0].parameters if row.physical)
-        fits = [estimate(e, e.local(s.values), list(s.flagged.get(e.label, []))) for e in members]
-        freedom = [np.inf if e.scale_known else one.freedom for e, one in zip(members, fits, strict=True)]
-        groups.append((members, heterogeneity([one.scaled(one.scale)[symbol] for one in fits], freedom)))
+        fits = [refit(e, e.local(s.values), list(s.flagged.get(e.label, []))) for e in members]
+        groups.append((list(members), heterogeneity([one[symbol] for one in fits], freedom)))
     return groups
 
 

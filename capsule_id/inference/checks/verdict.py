@@ -9,9 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from capsule_id.errors import InputError
-from capsule_id.experiments.base import LEVEL, Experiment, correlated_records, estimate, refit
-from capsule_id.experiments.friction_model import EQUATION_1
+from capsule_id.experiments.base import LEVEL, Experiment, correlated_records, refit
 from capsule_id.experiments.statistics import LAGS, judged, weighted_mean
 from capsule_id.inference.checks.posterior import (
     PRIOR_PULL,
@@ -244,46 +242,52 @@ def _boundary(s: SampledFit) -> list[Finding]:
 
 # widening: Error of the model, from the scatter of a parameter between parts of the data.
 #
-# Where a check of an experiment fails, its readings and those of its kind that inform the same parameters are
-# divided into parts of consecutive rows. Each part gives an estimate with its own sd. Their weighted chi-square
-# over its degrees of freedom is the squared factor of the sd (Birge 1932), and Student's t gives the interval.
+# residuals and Jacobian at the fit -> derivative with respect to one parameter, the others refitted
+#     -> step of that parameter from every part -> chi-square between the parts (``widening``)
+#
+# Where a check of a bench test fails, the tests of its kind are divided into parts, else the run that fails. Each part
+# gives a Gauss-Newton step of one parameter and its sd, at the scatters of the fit, which hold the misfit already. Their
+# weighted chi-square over its degrees of freedom is the squared factor of the sd (Birge 1932), and Student's t gives the
+# interval. A misfit that repeats with every period shows between phases only. The widest interval counts.
 
 
-#: Fewest parts of the data, and most parts of one table.
+#: Fewest parts of the data, and most of one table: long parts show slow errors, many parts show them more surely.
 FEWEST_PARTS, MOST_PARTS = 4, 8
-#: From more tests than this on, ``FEWEST_PARTS`` of each are enough.
-MANY_TESTS = 32
-#: Fewest rows of a part, relative to the number of unknowns of its experiment.
-ROWS_PER_UNKNOWN = 2
+#: Number of the priors, which every part meets. Without them the step of a parameter that the data leave open has no end.
+PRIORS = -2
 #: Largest sd of a part that determines a parameter, relative to its value.
 LARGEST_RELATIVE_SD = 0.5
 #: Smallest factor of an sd that counts.
 SMALLEST_FACTOR = 1.01
+#: Numbers of the parts of the n readings of a test; None where it cannot be divided in this way.
+Division = Callable[[Experiment], Int[np.ndarray, " n"] | None]
 
 
 def widenings(s: SampledFit) -> dict[str, Widening]:
-    """Error of the model of every physical parameter that a failed check of its bench test concerns, by name."""
+    """Error of the model of every physical parameter that a failed check of its test concerns, by name."""
     failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
-    kinds = {e.kind for e in s.experiments if e.label in failed or e.table.label in failed}
-    by_load = {f.experiment for f in s.findings if f.code == "trials.loads" and f.level == "fail"}
-    tests = [e for e in s.experiments if e.kind in kinds and e.bench and not has_own_nuisances(e)]
+    kinds = {e.kind for e in s.experiments if e.bench and {e.label, e.table.label} & failed}
+    tests = [e for e in s.experiments if e.kind in kinds or {e.label, e.table.label} & failed]
+    # Stated values are no estimates from the parts: ``beside_stated`` adds their share of the sd.
+    located = s.target.located[[not is_stated(s.target.names[i]) for i in s.target.located]]
+    informed = {row.name for e in tests for row in e.parameters if row.physical}
+    if not informed:
+        return {}
+    residuals, jacobian = linearised(s.target, s.fit.u)
+    jacobian = jacobian[:, np.isin(s.target.located, located)]
+    if not np.isfinite(jacobian).all():  # no start of the fit has found a maximum
+        return {}
     found: dict[str, Widening] = {}
-    # Long parts show slow errors, many parts show them more surely: many tests are many parts. The widest interval counts.
-    for number in (FEWEST_PARTS, MOST_PARTS)[: 1 if len(tests) > MANY_TESTS else 2]:
-        estimates: dict[str, list[tuple[float, float]]] = {}
-        for e in tests:
-            for name, pair in estimates_of_parts(e, s.values, number, by_load=e.label in by_load):
-                estimates.setdefault(name, []).append(pair)
-        for name, pairs in estimates.items():
-            _keep_widest(found, name, pairs)
+    for division in (by_phase, by_load, *(partial(by_time, number=i) for i in range(FEWEST_PARTS, MOST_PARTS + 1))):
+        part = parts_of_residuals(s, tests, division)
+        for k, (i, name) in enumerate((i, s.target.names[i]) for i in located):
+            largest_sd = LARGEST_RELATIVE_SD * (1.0 if s.target.positive[i] else abs(s.fit.u[i]))
+            pairs = steps_of_parts(jacobian, residuals, k, part) if name in informed else []
+            pairs = [pair for pair in pairs if pair[1] < largest_sd]
+            one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
+            if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
+                found[name] = one
     return found
-
-
-def _keep_widest(found: dict[str, Widening], name: str, pairs: Sequence[tuple[float, float]]) -> None:
-    """Enter the widening of the parameter ``name`` by ``pairs`` of enough parts where it is the widest so far."""
-    one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
-    if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
-        found[name] = one
 
 
 def beside_stated(s: SampledFit, found: Mapping[str, Widening]) -> dict[str, Widening]:
@@ -307,17 +311,12 @@ def beside_stated(s: SampledFit, found: Mapping[str, Widening]) -> dict[str, Wid
 
 def model_errors(s: SampledFit) -> dict[str, Widening]:
     """Error of the model by name of the parameter: from parts of the data, and what the readings allow (forces, a hold)."""
-    found = beside_stated(s, {**widenings(s), **record_widenings(s)})
+    found = beside_stated(s, widenings(s))
     for facts in (f.facts for f in s.findings if f.level == "warn" and f.code in ("decays.hidden", "decays.held")):
         one = found.get(facts["name"], Widening(1.0, 1.0, 0))
         low, high = one.limits or (np.inf, -np.inf)
         found[facts["name"]] = replace(one, limits=(min(low, facts["low"]), max(high, facts["high"])))
     return found
-
-
-def has_own_nuisances(e: Experiment) -> bool:
-    """Whether ``e`` is a run, or a record with an amplitude of its own: its parts have other nuisances than the whole."""
-    return e.event_driven or any(not (row.physical or row.scatter or is_stated(row.name)) for row in e.parameters)
 
 
 def widening(pairs: Sequence[tuple[float, float]]) -> Widening:
@@ -327,125 +326,36 @@ def widening(pairs: Sequence[tuple[float, float]]) -> Widening:
     return Widening(max(1.0, float(np.sqrt(chi_square / freedom))), quantile, len(pairs))
 
 
-def estimates_of_parts(
-    e: Experiment, values: Mapping[str, float], number: int, by_load: bool = False
-) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Name, estimate and standard error of every physical parameter from every part of ``e`` that can be fitted.
-
-    The parts share one noise level, from all of their misfits: those of a few rows are too uncertain to weight them.
-
-    Parameters
-    ----------
-    number : of parts, fewer where they would have too few rows
-    by_load : whether a part holds the rows of one load, of similar loads where there are many, not consecutive rows
-    """
-    parts = []
-    for rows in rows_of_parts(e, values, number, by_load):
-        try:
-            columns = {name: replace(own, values=own.values[rows]) for name, own in e.table.columns.items()}
-            table = replace(e.table, columns=columns, rows=e.table.rows[rows])
-            (part,) = type(e).make(table, e.rig, getattr(e, "friction", EQUATION_1))
-            with np.errstate(all="ignore"):
-                parts.append((part, estimate(part, part.local(values), [])))
-        except (InputError, ValueError, np.linalg.LinAlgError, IndexError, ArithmeticError):
-            continue  # a part without motion or with one level of x determines nothing
-    if not parts:
-        return
-    freedom = [one.freedom for _, one in parts]
-    scale = float(np.average([one.scale for _, one in parts], weights=freedom))
-    for part, one in parts:
-        found = one.scaled(scale)
-        for row in part.parameters:
-            value, sd = found.get(row.symbol, (np.nan, np.nan))
-            if 0.0 < sd < LARGEST_RELATIVE_SD * abs(value):
-                yield row.name, (value, sd)
+def by_time(e: Experiment, number: int = MOST_PARTS) -> Int[np.ndarray, " n"] | None:
+    """Successive parts, of whole periods of a run; -1: the end of a decay, which is all noise."""
+    if e.event_driven:
+        cycle = (e.cycles - e.cycles[0]).astype(int) if e.cycles is not None and number == MOST_PARTS else None
+        return cycle if cycle is None else cycle * min(int(cycle[-1]) + 1, number) // (int(cycle[-1]) + 1)
+    rows = np.arange(e.n if e.cycles is None else len(e.cycles))
+    # Most of the energy of a record lies before it is all noise.
+    end = length_of_motion(e.observed[: len(rows)]) if e.time_series else len(rows)
+    return np.where(rows < end, rows * min(number, max(end // 2, 1)) // end, -1)
 
 
-def rows_of_parts(e: Experiment, values: Mapping[str, float], number: int, by_load: bool) -> list[np.ndarray]:
-    """Rows of the parts of ``e``; parameters as in ``estimates_of_parts``; [] for a table that is too short."""
-    unknowns = (
-        sum(not (row.scatter or is_stated(row.name)) for row in e.parameters)
-        + e.misfit(e.local(values)).design.shape[1]
-    )
-    rows = np.arange(len(e.table.rows))
-    if e.time_series and e.n == len(rows):
-        # Most of the energy of a record lies before it is all noise.
-        rows = rows[: length_of_motion(e.observed)]
-    number = min(number, len(rows) // max(ROWS_PER_UNKNOWN * unknowns, 3))
-    if number < 2:
-        return []
-    if e.loads is None or not by_load:
-        return np.array_split(rows, number)
+def by_phase(e: Experiment) -> Int[np.ndarray, " n"] | None:
+    """The same parts of every excitation period; None of other tests: the period of a decay is not exactly known."""
+    return None if e.cycles is None or not e.event_driven else (e.cycles % 1.0 * PHASES).astype(int) % PHASES
+
+
+def by_load(e: Experiment) -> Int[np.ndarray, " n"] | None:
+    """Trials of one normal force, of similar ones where there are many."""
+    if e.loads is None:
+        return None
     levels, index = np.unique(e.loads[0], return_inverse=True)
-    if FEWEST_PARTS <= len(levels) <= MOST_PARTS:
-        return [np.flatnonzero(index == level) for level in range(len(levels))]
-    return np.array_split(np.argsort(e.loads[0], kind="stable"), number)
+    return index * min(len(levels), MOST_PARTS) // len(levels)
 
 
-# record widening: Error of the model in runs and decays, from the scores of parts of their records.
-#
-# residuals and Jacobian at the fit -> derivative with respect to one parameter, the others refitted
-#     -> step of that parameter from every part -> chi-square between the parts (``widening``)
-#
-# A run, or a decay with an amplitude, a drift or noise of its own, determines some parameters only as a whole, so its
-# parts are not fitted. Each part gives a Gauss-Newton step of one parameter and its sd. A record is divided into
-# successive whole periods, that of a run also by phase of the excitation. A misfit that repeats with every period shows
-# between phases only. The widest interval counts.
-
-
-#: Number of the priors, which every part meets. Without them the step of a parameter that the data leave open has no end.
-PRIORS = -2
-#: Numbers of the parts of the n samples of a record; None where it cannot be divided in this way.
-Division = Callable[[Experiment], Int[np.ndarray, " n"] | None]
-
-
-def record_widenings(s: SampledFit) -> dict[str, Widening]:
-    """Error of the model of every physical parameter of a run or a decay with a failed check, by name."""
-    failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
-    records = [e for e in s.experiments if {e.label, e.table.label} & failed and has_own_nuisances(e)]
-    if not any(e.cycles is not None for e in records):
-        return {}
-    # Stated values are no estimates from the parts: ``beside_stated`` adds their share of the sd.
-    estimated = np.array([not is_stated(s.target.names[i]) for i in s.target.located])
-    (residuals, jacobian), located = linearised(s.target, s.fit.u), s.target.located[estimated]
-    jacobian = jacobian[:, estimated]
-    if not np.isfinite(jacobian).all():  # no start of the fit has found a maximum
-        return {}
-    informed = {row.name for e in records for row in e.parameters if row.physical}
-    found: dict[str, Widening] = {}
-    for division in (by_time, by_phase):
-        part = parts_of_residuals(s, records, division)
-        for k, i in enumerate(located.tolist()):
-            if s.target.names[i] in informed:
-                largest_sd = LARGEST_RELATIVE_SD * (1.0 if s.target.positive[i] else abs(s.fit.u[i]))
-                pairs = [pair for pair in steps_of_parts(jacobian, residuals, k, part) if pair[1] < largest_sd]
-                _keep_widest(found, s.target.names[i], pairs)
-    return found
-
-
-def by_time(record: Experiment) -> Int[np.ndarray, " n"] | None:
-    """Successive parts of whole periods, about equally long; -1: the end of a decay, which is all noise."""
-    if record.cycles is None:
-        return None
-    cycle = (record.cycles - record.cycles[0]).astype(int)
-    end = len(cycle) if record.event_driven else length_of_motion(record.observed)
-    number = int(cycle[end - 1]) + 1
-    return np.where(np.arange(len(cycle)) < end, cycle * min(number, MOST_PARTS) // number, -1)
-
-
-def by_phase(record: Experiment) -> Int[np.ndarray, " n"] | None:
-    """The same parts of every excitation period; None of a decay, whose period is not exactly known."""
-    if record.cycles is None or not record.event_driven:
-        return None
-    return (record.cycles % 1.0 * PHASES).astype(int) % PHASES
-
-
-def parts_of_residuals(s: SampledFit, records: Sequence[Experiment], division: Division) -> Int[np.ndarray, " m"]:
+def parts_of_residuals(s: SampledFit, tests: Sequence[Experiment], division: Division) -> Int[np.ndarray, " m"]:
     """Part of each of ``LogPosterior.residuals``; -1, one more part, for other experiments; ``PRIORS`` for priors."""
     parts, used = [], 0
     for e in s.experiments:
         own = np.full(len(e.residuals(e.local(s.values), np)), -1)
-        numbers = next((division(one) for one in records if one is e), None)
+        numbers = next((division(one) for one in tests if one is e), None)
         if numbers is not None:
             channels = e.n // len(numbers)
             own[: channels * len(numbers)] = np.tile(np.where(numbers < 0, -1, used + numbers), channels)
@@ -464,21 +374,25 @@ def steps_of_parts(
     no step: the first period of a strong decay holds most of what the record tells.
     """
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
-    jacobian = jacobian / scale
-    others = np.linalg.qr(np.delete(jacobian, k, axis=1))[0]
-    own = jacobian[:, k] - others @ (others.T @ jacobian[:, k])
+    jacobian, numbers = jacobian / scale, np.unique(part)
+    members = [part == number for number in numbers]
+    # The normal matrix and the gradient of every part: a rig may have thousands of parts and 1e5 residuals.
+    matrices = np.array([jacobian[rows].T @ jacobian[rows] for rows in members])
+    gradients = np.array([jacobian[rows].T @ residuals[rows] for rows in members])
+    # The derivative with respect to parameter k, the others refitted, as a combination of those of all parameters.
+    whole, unit = np.sum(matrices, axis=0), np.eye(len(scale))[k]
+    own = unit.copy()
+    others = unit == 0.0
+    own[others] = -np.linalg.lstsq(whole[np.ix_(others, others)], whole[others, k], rcond=None)[0]
     pairs = []
-    for number in np.unique(part[part != PRIORS]):
-        rows, rest = part == number, part != number
-        information = float(np.sum(own[rows] ** 2))
-        if information == 0.0 or np.linalg.matrix_rank(jacobian[rest]) < jacobian.shape[1]:
+    for number, matrix, gradient in zip(numbers, matrices, gradients, strict=True):
+        rest, information = whole - matrix, own @ matrix @ own
+        if number == PRIORS or not information > 0.0 or np.linalg.matrix_rank(rest, hermitian=True) < len(scale):
             continue
-        effect = -own[rows] @ jacobian[rows] / information
-        effect[k] += 1.0
-        if effect @ np.linalg.solve(jacobian[rest].T @ jacobian[rest], effect) > 1.0 / information:
+        effect = unit - own @ matrix / information
+        if effect @ np.linalg.solve(rest, effect) > 1.0 / information:
             continue
-        step = np.linalg.lstsq(jacobian[rest], -residuals[rest], rcond=None)[0]
-        beyond = residuals[rows] + jacobian[rows] @ step
-        value = step[k] - float(own[rows] @ beyond) / information
+        step = -np.linalg.solve(rest, np.sum(gradients, axis=0) - gradient)
+        value = step[k] - own @ (gradient + matrix @ step) / information
         pairs.append((value / scale[k], information**-0.5 / scale[k]))
     return pairs

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -21,11 +20,10 @@ from capsule_id.inference.checks.verdict import (
     PRIORS,
     by_phase,
     by_time,
-    estimates_of_parts,
     parts_of_residuals,
-    record_widenings,
     steps_of_parts,
     widening,
+    widenings,
 )
 from capsule_id.inference.point_stage import SampledFit
 from capsule_id.inference.result import PointFit
@@ -37,30 +35,6 @@ from tests.inference.stub import plain_jacobian, plain_residuals
 from tests.measured.folders import Entry, make_rig, quantity
 
 NO_ARRAY = np.zeros(0)
-
-
-@pytest.mark.parametrize(("tests", "numbers"), [(2, {4, 8}), (40, {4})])
-def test_few_tests_are_divided_twice_and_many_once(
-    tests: int, numbers: set[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Before: of 500 decays 6,000 parts were fitted. The widest interval of both divisions counts."""
-    asked = set[int]()
-
-    def parts(_: object, __: object, number: int, by_load: bool) -> list[tuple[str, tuple[float, float]]]:
-        asked.add(number)
-        return [("k2", (10.0 + number * side, 1.0)) for side in (-1.0, 1.0)]
-
-    monkeypatch.setattr(verdict, "estimates_of_parts", parts)
-    made = [
-        SimpleNamespace(label=f"s{i}", kind="spring", bench=True, event_driven=False, parameters=())
-        for i in range(tests)
-    ]
-    for e in made:
-        e.table = e
-    s = SimpleNamespace(findings=[Finding("lines.straight", "fail", {}, "s0")], experiments=made, values={})
-    (one,) = verdict.widenings(cast(SampledFit, s)).values()
-    assert asked == numbers
-    assert one.factor == pytest.approx(max(numbers) * np.sqrt(2 * tests / (2 * tests - 1)))
 
 
 @cache
@@ -125,19 +99,19 @@ def test_noise_alone_widens_little(known: SampledFit) -> None:
 def test_a_failed_check_widens_the_parameters_of_its_run(known: SampledFit, monkeypatch: pytest.MonkeyPatch) -> None:
     """By residuals and differences in NumPy: the derivatives of a run take ten seconds to compile."""
     monkeypatch.setattr(verdict, "linearised", lambda *at: (plain_residuals(*at), plain_jacobian(*at)))
-    assert record_widenings(replace(known, findings=())) == {}
-    quiet = record_widenings(known)
+    assert widenings(replace(known, findings=())) == {}
+    quiet = widenings(known)
     assert all(one.factor < 2.0 for one in quiet.values())
     # The rod's spring is 10 % stiffer than the record shows.
     u = known.fit.u + np.where(np.array(known.target.names) == "k1", 0.1, 0.0)
     values = {**known.values, "k1": 1.1 * known.values["k1"]}
-    wide = record_widenings(replace(known, fit=replace(known.fit, u=u), values=values))
+    wide = widenings(replace(known, fit=replace(known.fit, u=u), values=values))
     assert wide["k1"].factor > 5.0
     assert wide["k1"].parts >= FEWEST_PARTS
     assert set(wide) <= set(shaken.TRUTH)
     # A fit no start of which has found a maximum may lie where no derivative is finite.
     monkeypatch.setattr(verdict, "linearised", lambda *at: (plain_residuals(*at), np.nan * plain_jacobian(*at)))
-    assert record_widenings(known) == {}
+    assert widenings(known) == {}
 
 
 def test_parts_are_whole_periods_and_phases(known: SampledFit) -> None:
@@ -226,33 +200,13 @@ def test_intervals_of_a_decay_with_an_amplitude_of_its_own_cover_under_misfit() 
 def test_a_failed_check_widens_the_parameters_of_a_decay_with_dry_friction(monkeypatch: pytest.MonkeyPatch) -> None:
     """As for a run, by differences: the derivatives of a decay with dry friction take as long to compile."""
     monkeypatch.setattr(verdict, "linearised", lambda *at: (plain_residuals(*at), plain_jacobian(*at)))
-    assert record_widenings(replace(dry_decay(), findings=())) == {}
-    assert all(one.factor < 1.01 for one in record_widenings(dry_decay()).values())
+    assert widenings(replace(dry_decay(), findings=())) == {}
+    assert all(one.factor < 1.01 for one in widenings(dry_decay()).values())
     # The stiffness falls by 5 % with the amplitude.
-    wide = record_widenings(dry_decay(0.05 * 1420.0 / 2e-3**2))
+    wide = widenings(dry_decay(0.05 * 1420.0 / 2e-3**2))
     assert wide["k1"].factor > 3.0
     assert wide["k1"].parts >= FEWEST_PARTS
     assert set(wide) <= {"k1", "c", "F_dry"}
-
-
-def test_parts_of_noise_alone_determine_nothing(tmp_path: Path) -> None:
-    """Before: c of such a part was 1e-10 with an sd of 1e-20, or its k1 7e-6 N/m, and c of 50 clean decays got no number."""
-    rng, t = np.random.default_rng(3), np.linspace(0.0, 0.3, 400)
-    omega, rate = np.sqrt(1422.0 / 0.11), 3.88 / (2.0 * 0.11)
-    damped, entries = np.sqrt(omega**2 - rate**2), []
-    for i in range(17):
-        size = rng.uniform(1.5, 3.0)
-        x = np.exp(-rate * t) * (np.cos(damped * t) + rate / damped * np.sin(damped * t))
-        columns = {"time [s]": np.round(t, 7), "x_rel [mm]": np.round(size * x + rng.normal(0.0, 0.01, 400), 5)}
-        entries.append(Entry("free_vibration", f"d{i}", columns))
-    rig = make_rig(tmp_path, *(entries[i] for i in (9, 16)), head={"m1": quantity(0.11, "kg", 0.0005)})
-    experiments = make_experiments(rig)
-    target = LogPosterior(rig, experiments)
-    values = {name: start.centre for name, start in target.starts().items()} | dict(target.fixed)
-    values |= {"k1": 1422.0, "c": 3.88}
-    found = [(values[name], pair) for e in experiments for name, pair in estimates_of_parts(e, values, 8)]
-    assert len(found) > 8
-    assert all(abs(value - truth) < 30.0 * sd for truth, (value, sd) in found)
 
 
 def test_a_parameter_without_effect_has_no_estimate(tmp_path: Path) -> None:
