@@ -87,6 +87,43 @@ def test_a_profile_is_the_ridge_of_a_grid(tmp_path: Path) -> None:
         profile(target, fit, "k9")
 
 
+@pytest.mark.full
+def test_a_profile_of_pushes_is_the_largest_value_of_grids(tmp_path: Path) -> None:
+    """v_s of pushes at 0.2 to 0.8 v_s, one-sided: at each v_s the largest value over a grid of mu and the scatter."""
+    v = np.linspace(0.06, 0.24, 12)
+    rows = "".join(
+        f"{a:.5f},{1e3 * d:.6f}\n"
+        for a, d in zip(
+            v, (0.5 * v**2 + v**4 / (4.0 * 0.09)) / (0.6 * 9.81) * (1.0 + 0.02 * np.cos(9.0 * v)), strict=True
+        )
+    )
+    (tmp_path / "pushes.csv").write_text(f"speed [m/s],distance [mm]\n{rows}", encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(
+        (HEAD % 0.0).replace("sd = 0.5, ", "").replace("sd = 0, ", "")
+        + '[[experiment]]\nkind = "dynamic_friction"\nfile = "pushes.csv"\n',
+        encoding="utf-8",
+    )
+    target, fit = _fit(tmp_path)
+    assert len(target.names) == 3
+    i = target.names.index("v_s")
+    others = [j for j in range(3) if j != i]
+    found = profile(target, fit, "v_s")
+    u, sd = np.log(found["value"].to_numpy()), np.sqrt(np.diag(fit.covariance))
+    heights = []
+    for value in u:
+        at, width = fit.u[others], 10.0 * sd[others]
+        for _ in range(5):  # each grid within the steps of the one before
+            axes = [x + w * np.linspace(-1.0, 1.0, 41) for x, w in zip(at, width, strict=True)]
+            points = np.full((41**2, 3), value)
+            points[:, others] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+            density = density_of(target)(points)
+            at, width = points[np.argmax(density)][others], width / 8.0
+        own = target.priors.at(slice(None), np).terms(points[0], target.theta(points[0]), np)[i]
+        heights.append(density.max() - own)
+    np.testing.assert_allclose(found["profile"], np.array(heights) - max(heights), atol=2e-4)
+    assert np.abs(found["profile"] - found["curvature"]).max() > 0.1
+
+
 @pytest.mark.parametrize(
     ("c", "m1_sd", "damping"), [(3.9, 0.5, "bounded"), (3.9, 20.0, "bounded, tied to m1"), (1e-4, 0.5, "upper limit")]
 )
@@ -116,6 +153,64 @@ def test_words_of_slow_pushes(tmp_path: Path, prior: str, word: str) -> None:
     (folder / "rig.toml").write_text(HEAD % 0.5 + prior + "".join(entries), encoding="utf-8")
     (table,) = identified(*_fit(folder))
     assert table.frame["known"].to_dict() == {"mu": "bounded", "v_s": word}
+
+
+INSTRUMENT = '[[instrument]]\nname = "cell"\n%s\n[[experiment]]\nkind = "%s"\nfile = "readings.csv"\n%s'
+STEPS = np.linspace(1.0, 8.0, 8)
+SCATTER = 1.0 + 0.002 * (-1.0) ** np.arange(8)
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "word"),
+    [
+        (
+            INSTRUMENT
+            % ('gain = { sd = 5, unit = "%" }', "support_spring", 'spring = "a"\nforce_instrument = "cell"\n'),
+            {"deflection [mm]": STEPS, "force [N]": 5.0 * STEPS * SCATTER},
+            {"k2[a]": "bounded, tied to gain[cell]"},
+        ),
+        (
+            INSTRUMENT % ('gain = { sd = 5, unit = "%" }', "motor_current", 'force_instrument = "cell"\n'),
+            {"current [A]": 0.2 * STEPS, "force [N]": 0.4 * STEPS * SCATTER},
+            {"K": "bounded, tied to gain[cell]"},
+        ),
+        (
+            INSTRUMENT % ('offset = { sd = 2, unit = "deg" }', "static_friction", 'angle_instrument = "cell"\n'),
+            {"angle [deg]": 31.0 * SCATTER},
+            {"mu": "bounded, tied to offset[cell]"},
+        ),
+    ],
+)
+def test_words_of_what_an_instrument_scales(
+    tmp_path: Path, text: str, columns: dict[str, np.ndarray], word: dict[str, str]
+) -> None:
+    """An unknown gain or zero of the one instrument moves the parameter as its own change does."""
+    rows = "".join(",".join(f"{x:.6g}" for x in row) + "\n" for row in np.column_stack(list(columns.values())))
+    (tmp_path / "readings.csv").write_text(",".join(columns) + "\n" + rows, encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(HEAD % 0.5 + text, encoding="utf-8")
+    (table,) = identified(*_fit(tmp_path))
+    assert table.frame["known"].to_dict() == word
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"viscous"', '["viscous", "dry"]', {"k1": "bounded, tied to m1", "c": "bounded", "F_dry": "upper limit"}),
+        (
+            'noise = "white"',
+            'noise = "white"\nclock = { value = 0, sd = 3, unit = "%" }',
+            {"k1": "bounded, tied to clock_drift[decay]", "c": "bounded, tied to k1"},
+        ),
+    ],
+)
+def test_words_of_a_force_that_is_not_there_and_of_an_unknown_clock(
+    tmp_path: Path, old: str, new: str, words: dict[str, str]
+) -> None:
+    folder = _decay(tmp_path / "rig", 3.9, 0.5)
+    text = (folder / "rig.toml").read_text(encoding="utf-8")
+    (folder / "rig.toml").write_text(text.replace(old, new), encoding="utf-8")
+    (table,) = identified(*_fit(folder))
+    assert table.frame["known"].to_dict() == words
 
 
 def test_the_command_draws_profiles_into_the_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
