@@ -167,8 +167,8 @@ class Fit(Result):
 
     @property
     def failed(self) -> list[str]:
-        """Titles of the failed checks."""
-        return sorted({title for level, title in self._titles if level == "fail"})
+        """Titles of the failed checks, causes first."""
+        return list(dict.fromkeys(title for level, title in self._titles if level == "fail"))
 
     @property
     def verdict(self) -> str:

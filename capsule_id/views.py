@@ -68,6 +68,15 @@ def filled_in(text: str, facts: Facts) -> str:
     return _Texts().vformat(text, (), facts)
 
 
+#: Checks of what one fault of a record leaves behind: where another check names a fault, they fail with it.
+SYMPTOMS = (
+    "residuals.white", "residuals.statistics", "decays.residuals", "decays.halves", "decays.onset", "decays.drift",
+    "decays.hidden", "decays.position", "decays.stiffness", "runs.repeated", "errors.stated", "starts.agree", "model.error",
+)  # fmt: skip
+#: Warnings that name the cause of failed checks.
+CAUSES = ("decays.changing", "decays.tone")
+
+
 @dataclass(frozen=True)
 class Finding:
     """The outcome of one check.
@@ -94,6 +103,11 @@ class Finding:
     def __post_init__(self) -> None:
         if self.level not in get_args(Level):
             raise ValueError(f"level of finding {self.code} must be one of {get_args(Level)}; found {self.level!r}")
+
+    @property
+    def cause(self) -> bool:
+        """Whether it names a fault that other failed checks of its experiment may come from."""
+        return (self.level == "fail" and self.code not in SYMPTOMS) or (self.level == "warn" and self.code in CAUSES)
 
 
 @dataclass(frozen=True)

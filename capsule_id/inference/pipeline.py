@@ -136,7 +136,7 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     stop_if_interrupted()
     before = [with_scaled(finding, sampled.experiments) for finding in before]
     checked = run_checks(replace(sampled, findings=before))
-    findings = [*checked.findings, *sampled.findings, *check_agreement(sampled), *check_engine(sampled), *before]
+    findings = [*before, *checked.findings, *sampled.findings, *check_agreement(sampled), *check_engine(sampled)]
     widened = model_errors(replace(checked, findings=findings))
     for lost in (False, True):
         factors = [
@@ -145,6 +145,8 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
         if factors:
             names = tuple(name for name, *_ in factors) if lost else ()
             findings.append(Finding("model.error", "fail" if lost else "warn", {"factors": factors}, parameters=names))
+    # Causes first, and of these what the readings show by themselves.
+    findings.sort(key=lambda found: (not found.cause, found.cause and found.level == "warn"))
     return replace(checked, widened=widened, findings=tuple(findings))
 
 

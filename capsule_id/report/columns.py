@@ -432,11 +432,11 @@ def wrapped(texts: Sequence[str], width: int | None = None) -> list[str]:
 
 
 def verdict_text(trust: Trust, findings: Sequence[tuple[Level, str]]) -> str:
-    """The verdict in one line, from level and title of the findings: the failed checks, the number of warnings.
+    """The verdict in one line, from level and title of the findings: the failed checks, causes first, the number of warnings.
 
     Console and report have these words.
     """
-    failed = ", ".join(sorted({title for level, title in findings if level == "fail"}))
+    failed = ", ".join(dict.fromkeys(title for level, title in findings if level == "fail"))
     found = f"failed: {failed}" if failed else "no check failed"
     if trust == "not judged" and not failed:
         found += ", but not every number could be checked"

@@ -457,13 +457,30 @@ def next_steps(result: Result) -> list[tuple[str, str]]:
 
 
 def _faults(result: Result) -> Iterator[tuple[str, str]]:
-    """Failed checks, then warnings that leave a parameter unjudged; the finding says what to do."""
-    messages = messages_of(result.registry)
+    """Failed checks, then warnings that leave a parameter unjudged; the finding says what to do.
+
+    What fails beside a cause of the same experiment is named with the cause: its own remedy may harm.
+    """
+    messages, shares = messages_of(result.registry), result.point_fit.shares
+    causes = [finding for finding in result.findings if finding.cause and finding.experiment]
+    followers = defaultdict[str, list[str]](list)
+    others = list[Finding]()
+    for one in result.findings:
+        informing = {label for name in one.parameters for label, share in shares.get(name, {}).items() if share > SMALL}
+        places = {one.experiment} if one.experiment else informing
+        place = next((cause.experiment for cause in causes if cause.experiment in places), "")
+        if place and one.level == "fail" and not one.cause:
+            followers[place].append(title_of(one.code, messages))
+        else:
+            others.append(one)
     for level, heading in (("fail", "Correct"), ("warn", "Look at")):
-        for finding in result.findings:
-            if finding.level == level and (level == "fail" or finding.parameters):
-                place = f"experiment {finding.experiment}" if finding.experiment else ", ".join(finding.parameters)
-                yield f"{heading} {place or 'the whole fit'}", finding_text(finding, messages)
+        for one in (one for one in others if one.level == level):
+            own = ", ".join(dict.fromkeys(followers.pop(one.experiment, []) if one.cause else []))
+            if not (own or level == "fail" or one.parameters):
+                continue
+            first = f"Probably the cause of further failed checks ({own}). " if own else ""
+            place = f"experiment {one.experiment}" if one.experiment else ", ".join(one.parameters) or "the whole fit"
+            yield f"{heading} {place}", first + finding_text(one, messages)
 
 
 def _missing(result: Result) -> Iterator[tuple[str, str]]:

@@ -38,7 +38,7 @@ def test_stages_one_by_one_give_the_numbers_of_the_whole(tmp_path: Path) -> None
     before = check_readings(rig, "bench", kinds)
     checked = check_fit(sampled, before)
     assert before
-    assert checked.findings[-len(before) :] == before
+    assert [found for found in checked.findings if found in before] == list(before)
     result = make_result(checked, kinds, seeds.report, provenance(rig, 3, "bench", "eq. (1)"))
     assert sampled.findings == ()
     assert len(checked.findings) > 5

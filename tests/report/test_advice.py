@@ -1,13 +1,18 @@
 """What would improve a result: the input that decides an sd is named."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 import capsule_id as cid
 from capsule_id.inference.result import STATED, Result
 from capsule_id.report.html import next_steps
+from capsule_id.views import SYMPTOMS, Finding
 from tests.cli_tools import DATA
+from tests.experiments.bench import M1, released
+from tests.measured.folders import Entry, make_rig, quantity
 
 RECORDS = [f"free_vibration_{i}" for i in (1, 2, 3)]
 
@@ -64,3 +69,82 @@ def test_a_factor_of_a_hundred_is_written_out(sourced: Result) -> None:
     """Before: "at least 1e+02 times smaller"."""
     shares = with_shares(sourced, k1={f"{STATED}m1": 0.99999})
     assert "at least 100 times smaller" in dict(next_steps(shares))["Weigh m1 more precisely"]
+
+
+def spikes(x: np.ndarray) -> np.ndarray:
+    x[[450, 713, 818, 872]] += 0.6
+    return x
+
+
+def clipped(x: np.ndarray) -> np.ndarray:
+    return np.clip(x, -1.3, 1.3)
+
+
+def lost(x: np.ndarray) -> np.ndarray:
+    return np.delete(x, slice(300, 340))
+
+
+def frozen(x: np.ndarray) -> np.ndarray:
+    x[500:540] = x[500]
+    return x
+
+
+def second_mode(x: np.ndarray) -> np.ndarray:
+    t = np.arange(len(x)) / 2000.0
+    return x + 0.3 * np.exp(-3.0 * t) * np.cos(2.0 * np.pi * 47.0 * t)
+
+
+def warming(x: np.ndarray) -> np.ndarray:
+    """k1 falls by 8 % within the record."""
+    t = np.arange(len(x)) / 2000.0
+    noise = x - 2e3 * released(t, 1e-3, c=1.5)
+    return noise + 2.0 * np.exp(-1.5 / (2.0 * M1) * t) * np.cos(np.sqrt(1420.0 / M1) * (t - 0.025 * t**2))
+
+
+FAULTS = {
+    spikes: "readings.spike",
+    clipped: "readings.clipped",
+    lost: "readings.jump",
+    frozen: "readings.frozen",
+    second_mode: "decays.tone",
+    warming: "decays.changing",
+}
+
+
+TIERS = {spikes: (), lost: pytest.mark.slow, frozen: pytest.mark.slow}
+
+
+@pytest.mark.parametrize("fault", [pytest.param(fault, marks=TIERS.get(fault, pytest.mark.full)) for fault in FAULTS])
+def test_the_cause_of_failed_checks_is_the_first_step(tmp_path: Path, fault: object) -> None:
+    """The other failures of the record follow it in one sentence. Before: each had a step, and a remedy, of its own."""
+    assert callable(fault)
+    time = np.arange(1600) / 2000.0
+    x = 2e3 * released(time, 1e-3, c=1.5) + 0.01 * np.random.default_rng(0).standard_normal(1600)
+    read = np.round(fault(x), 5)
+    entry = Entry("free_vibration", "d", {"time [s]": time[: len(read)], "x_rel [mm]": read})
+    result = cid.fit(make_rig(tmp_path, entry, head={"m1": quantity(M1, "kg", 5e-5)}), budget=None)
+    (first, *_) = [found for found in result.findings if found.cause]
+    assert first.code == FAULTS[fault]
+    failed = {found.code for found in result.findings if found.level == "fail"}
+    steps = [text for heading, text in next_steps(result) if heading.startswith(("Correct", "Look"))]
+    if failed & {*SYMPTOMS}:
+        assert steps[0].startswith("Probably the cause of further failed checks (")
+    assert result.text(first) in steps[0]
+    assert not [text for text in steps[1:] if "white" in text or "like random noise" in text]
+
+
+def test_a_cause_explains_its_own_experiment_alone(result: Result) -> None:
+    """Negative control; a finding about a parameter belongs to the experiments that inform it."""
+    spike = Finding(
+        "lines.rise", "fail", {"name": "K", "slope": -1.0, "unit": "N/A", "x": "i", "y": "F"}, "motor_current"
+    )
+    white = Finding("starts.agree", "fail", {}, "free_vibration_1")
+    forces = Finding("model.error", "fail", {"factors": [("c", 40.0, 6)]}, parameters=("c",))
+    shares = {"c": {"free_vibration_1": 0.9, "motor_current": 0.01}}
+    known = replace(result, point_fit=replace(result.point_fit, shares=shares))
+    for place, headings in (
+        ("motor_current", ["Correct experiment motor_current", "Correct experiment free_vibration_1", "Correct c"]),
+        ("free_vibration_1", ["Correct experiment free_vibration_1"]),
+    ):
+        found = replace(known, findings=(replace(spike, experiment=place), white, forces))
+        assert [heading for heading, _ in next_steps(found) if heading.startswith("Correct")] == headings

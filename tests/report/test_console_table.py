@@ -47,9 +47,9 @@ def test_the_verdict_is_one_line_with_the_word_and_the_failed_checks() -> None:
     warned = [("warn", "outliers")] * 8
     assert verdict_text("trusted", warned) == "verdict: trusted; no check failed; 8 warnings"
     failed = [("fail", "outliers"), ("fail", "linearity"), ("fail", "outliers")]
-    assert verdict_text("not trusted", failed) == "verdict: not trusted; failed: linearity, outliers"
+    assert verdict_text("not trusted", failed) == "verdict: not trusted; failed: outliers, linearity"
     said = verdict_text("not trusted", [*failed, *warned[:1]])
-    assert said == "verdict: not trusted; failed: linearity, outliers; 1 warning"
+    assert said == "verdict: not trusted; failed: outliers, linearity; 1 warning"
     assert verdict_text("not judged", []).startswith("verdict: not judged; no check failed, but ")
 
 

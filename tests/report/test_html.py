@@ -313,7 +313,7 @@ def test_the_first_screen_has_value_trust_and_next_step(result: Result, unclean:
     """Before the contents list: the verdict, a row per parameter, what to do."""
     text = render(unclean, ())
     first = Page(text.partition("<nav")[0] + "</body></html>").text
-    assert "Verdict: not trusted; failed: residuals white, stated errors; 2 warnings." in first
+    assert "Verdict: not trusted; failed: stated errors, residuals white; 2 warnings." in first
     assert 'class="untrusted"' in text
     for row in table_rows(unclean.summary):
         assert row.plus_minus("value", "sd", row.decimals) in first
