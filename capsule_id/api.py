@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from capsule_id.console import OnProgress, Progress, fit_stages
 from capsule_id.errors import InputError
-from capsule_id.experiments.friction_model import CONSTANT, friction_of
+from capsule_id.experiments.friction_model import friction_of
 from capsule_id.experiments.kind import Choice, Registry, default_registry, make_experiments
 from capsule_id.inference.pipeline import (
     check_fit,
@@ -33,14 +33,14 @@ from capsule_id.inference.pipeline import (
 )
 from capsule_id.inference.planning import Plan, next_tests
 from capsule_id.inference.point_stage import fit_points
-from capsule_id.inference.prediction import DRAWS, predict, random_draws, require_equation_1
+from capsule_id.inference.prediction import DRAWS, predict, random_draws
 from capsule_id.inference.profiles import check_profiled
 from capsule_id.inference.result import Result, held_leaves
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
 from capsule_id.inference.tuning import Tuning, tune
 from capsule_id.output import check_directory, replace_file
-from capsule_id.parameters import by_index, is_stated, symbol_of
+from capsule_id.parameters import CAPSULE_LEAVES, by_index, is_stated, refuse_another_law, symbol_of
 from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
 from capsule_id.physics.model import CapsuleParameters, Drive, Trajectory
 from capsule_id.physics.simulation import simulate
@@ -262,11 +262,8 @@ class Fit(Result):
             friction, the spring was not fitted, or a parameter or the gap is missing.
         """
         chosen = random_draws(self, draws, np.random.default_rng(seed))
-        constant = self.rig.model.friction == "constant"
-        if not constant:
-            require_equation_1(self)
+        refuse_another_law(self.provenance.friction)
         stated = {name: x for name, x in held_leaves(self.rig).items() if x is not None}
-        stated |= CONSTANT if constant else {}
         values = {**stated, **self.fixed, "k2": 0.0, "G": gap, **chosen, **(given or {})}
         _warn_of_another_model(drive, self.rig.model.share_of_reaction, chosen)
         if spring is not None:
@@ -274,11 +271,17 @@ class Fit(Result):
             if spring not in springs:
                 known = ", ".join(springs)
                 raise InputError("spring must be a fitted one", repr(spring), f"choose from {known or 'none'}")
-            if np.any(np.isinf(values["G"])):
-                raise InputError(
-                    "a support spring needs its gap", f"{spring!r} alone", "give gap=1e-3, in m, or spring=None"
-                )
             values["k2"] = springs[spring]
+        if unknown := {*(given or {})} - {*CAPSULE_LEAVES}:
+            rule = "given must name leaves of CapsuleParameters"
+            raise InputError(rule, repr(min(unknown)), f"choose from {', '.join(CAPSULE_LEAVES)}")
+        stiff, near = np.any(np.asarray(values["k2"]) > 0.0), np.all(np.isfinite(values["G"]))
+        if stiff != near:
+            raise InputError(
+                "a support spring needs its gap, and a gap its spring",
+                f"k2 alone ({spring!r})" if stiff else "G alone",
+                "give both, spring='NAME' and gap=1e-3, in m, or neither",
+            )
         leaves = fields(CapsuleParameters)
         if missing := [leaf.name for leaf in leaves if leaf.default is MISSING and leaf.name not in values]:
             raise InputError(

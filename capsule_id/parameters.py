@@ -8,10 +8,13 @@ in ``k2[soft]`` or ``noise_sd[free_vibration_1]``. Positive parameters are sampl
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import NormalDist
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
+
+from capsule_id.errors import InputError
 
 Value = TypeVar("Value")
 
@@ -303,6 +306,20 @@ DRIVES: Mapping[str, tuple[str, ...]] = {
     "harmonic": ("P_d", "Omega", "phase", "reaction"),
     "pulses": ("P_on", "period", "duty", "P_off", "phase", "lag", "reaction"),
 }
+
+
+def refuse_another_law(law: str, file: str | Path = "") -> None:
+    """Refuse a result whose friction ``law``, as in its provenance, is neither eq. (1) nor that with ratio 1.
+
+    Raises
+    ------
+    InputError
+        Of another law, of which files hold the name alone.
+    """
+    if law.split(",")[0] not in ("eq. (1)", "constant friction"):
+        rule = "this computes with eq. (1), and the result must have been fitted with it or with constant friction"
+        raise InputError(rule, law, "call capsule_id.simulate(..., friction=law) in Python", file)
+
 
 #: The leaves of the model: fields of ``CapsuleParameters``, and those with the fields of the drives.
 CAPSULE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "capsule"}

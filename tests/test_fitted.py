@@ -340,8 +340,13 @@ def test_simulate_names_what_it_lacks(fitted: Fit, capsule: Fit) -> None:
     with pytest.raises(InputError, match="choose from soft"):
         capsule.simulate(DRIVE, TIMES, draws=5, spring="stiff")
     # Before: no contact, and not a word.
-    with pytest.raises(InputError, match="a support spring needs its gap, 'soft' alone, give gap=1e-3"):
+    with pytest.raises(InputError, match=r"spring needs its gap, and a gap its spring, k2 alone \('soft'\)"):
         capsule.simulate(DRIVE, TIMES, draws=5, spring="soft")
+    for wrong in ({"k2": 5e3}, {"G": 1e-3}):
+        with pytest.raises(InputError, match=r"alone.*, give both, spring='NAME' and gap=1e-3, in m, or neither"):
+            capsule.simulate(DRIVE, TIMES, draws=5, given=wrong)
+    with pytest.raises(InputError, match=r"given must name leaves of CapsuleParameters, 'k2\[soft\]', choose from m1"):
+        capsule.simulate(DRIVE, TIMES, draws=5, given={"k2[soft]": 9e4})
     with pytest.warns(UserWarning, match=r"the gap is 1000 mm and the largest \|x_rel\| .* mm: no contact"):
         capsule.simulate(DRIVE, TIMES, draws=5, spring="soft", gap=1.0)
     assert np.all(np.asarray(capsule.simulate(DRIVE, TIMES, draws=5).contacts) == 0)

@@ -229,7 +229,7 @@ def run(args: argparse.Namespace) -> int:
         measured: Sequence[MeasuredPoint] = ()
         diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
         if rig is not None and rig.has_runs and diagram:
-            by_name, fitted = args.spring if args.k2 is None else None, fitted_values(args.result)
+            by_name, fitted = args.spring if args.k2 is None else None, fitted_values(args.result, warn=False)
             measured, sentence = overlay(rig, axes[0].name, axes[0].values, values, fitted, by_name)
             complain(sentence)
         with own_style():

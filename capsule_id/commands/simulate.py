@@ -14,14 +14,12 @@ from capsule_id.commands import NO_CACHE, PATH, Option
 from capsule_id.console import complain, refusing_damage, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.output import replace_file
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, by_index
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, by_index, refuse_another_law
 from capsule_id.views import counted
 
 # options: Parameters of the capsule and its drive as options, and their values from a result.
 
 Value = TypeVar("Value")
-#: Name of the default friction law in the provenance of a result.
-EQUATION_1 = "eq. (1)"
 # From the paper's Table 1, or the default of the parameter table; other parameters have no default.
 DEFAULTS: Mapping[str, float] = {
     **{name: leaf.default for name, leaf in LEAVES.items() if isinstance(leaf.default, float)},
@@ -132,10 +130,10 @@ def whole_number(name: str, text: str, least: int = 0) -> int:
     return int(value)
 
 
-def fitted_values(directory: Path) -> dict[str, float | None]:
+def fitted_values(directory: Path, warn: bool = True) -> dict[str, float | None]:
     """Fitted values (maximum of the posterior) of DIR/parameters.json by name, SI, and those that its folder states.
 
-    None: the folder states several.
+    None: the folder states several. ``warn``: say on standard error what these values are not.
 
     Raises
     ------
@@ -147,15 +145,14 @@ def fitted_values(directory: Path) -> dict[str, float | None]:
     with refusing_damage(rule, remedy, file, lambda error: type(error).__name__):
         saved = json.loads(file.read_text(encoding="utf-8"))
         values = saved.get("fixed", {}) | {name: float(row["map"]) for name, row in saved["parameters"].items()}
-        law = str(saved.get("provenance", {}).get("friction", EQUATION_1))
+        law, trust = str(saved.get("provenance", {}).get("friction", "eq. (1)")), saved.get("trust")
     # The fitted values hold the free parameters of eq. (1) too.
-    if law.split(",")[0] != EQUATION_1:
-        raise InputError(
-            "the commands compute with eq. (1), and --result must have been fitted with it",
-            law,
-            "call capsule_id.simulate(..., friction=law) in Python",
-            file,
-        )
+    refuse_another_law(law, file)
+    lost = [name for name in ("F_dry", "c_q") if name in values]
+    if warn and lost:
+        complain(f"{file}: the capsule has no {' and no '.join(lost)}: its rod is damped by c alone")
+    if warn and trust == "not trusted":
+        complain(f"{file}: not trusted; look at the failed checks of its report before you use these values")
     return values
 
 

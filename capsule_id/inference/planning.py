@@ -28,11 +28,11 @@ from capsule_id.experiments.point_test import Line, PointTest
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.pipeline import check_readings, second_models
-from capsule_id.inference.prediction import random_draws, require_equation_1
+from capsule_id.inference.prediction import random_draws
 from capsule_id.inference.profiles import words_of
 from capsule_id.inference.result import Result
 from capsule_id.inference.target import LogPosterior, prior_sd
-from capsule_id.parameters import QUANTILE_975, by_index, is_stated, symbol_of
+from capsule_id.parameters import QUANTILE_975, by_index, is_stated, refuse_another_law, symbol_of
 from capsule_id.rig.model import Quantity, Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.schema import GroundSettings, QuantityRule
@@ -367,7 +367,7 @@ def next_tests(
         If nothing was sampled or another friction law was fitted, a target is not a physical parameter of the fit, or the
         time is too short for any test.
     """
-    require_equation_1(result)
+    refuse_another_law(result.provenance.friction)
     chosen = random_draws(result, draws, np.random.default_rng(seed))
     assert result.posterior is not None, "draws were taken"
     targets = _targets(result, targets)

@@ -54,13 +54,6 @@ def random_draws(result: Result, number: int, rng: np.random.Generator) -> dict[
     return dict(zip(result.posterior.names, chosen.T, strict=True))
 
 
-def require_equation_1(result: Result) -> None:
-    """Refuse a result that another friction law than eq. (1) was fitted to: its file does not hold the law."""
-    law = result.provenance.friction
-    if law.split(",")[0] != "eq. (1)":
-        raise InputError("this computes with eq. (1), and the result must have been fitted with it", law, "fit with it")
-
-
 def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Prediction:
     """Predict a new trial in a new session at each row of a table of settings.
 

@@ -7,6 +7,7 @@ from typing import get_args
 import numpy as np
 import pandas as pd
 
+from capsule_id.experiments.friction_model import CONSTANT
 from capsule_id.experiments.kind import Choice, Registry
 from capsule_id.records.view import RunRecord
 from capsule_id.rig.model import Rig
@@ -28,7 +29,8 @@ def held_leaves(rig: Rig) -> dict[str, float | None]:
     driven = [table.settings for table in rig.tables if hasattr(table.settings, "drive")]
     lags = {0.0 if one.lag is None else one.lag.value for one in driven if one.drive in ("pulses", "square")}
     values |= {"lag": lags.pop() if len(lags) == 1 else None} if lags else {}
-    return values | ({"P_off": None} if any(one.drive == "square" for one in driven) else {})
+    values |= {"P_off": None} if any(one.drive == "square" for one in driven) else {}
+    return values | (CONSTANT if rig.model.friction == "constant" else {})
 
 
 @dataclass(frozen=True)

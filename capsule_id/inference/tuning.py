@@ -14,11 +14,11 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.declaration import RunSettings
 from capsule_id.experiments.friction_model import ground_parameters
 from capsule_id.experiments.progression.declaration import AMPLITUDE, ProgressionSettings, settings_of
-from capsule_id.inference.prediction import random_draws, require_equation_1
+from capsule_id.inference.prediction import random_draws
 from capsule_id.inference.result import Result, held_leaves
 from capsule_id.motions.response import REST, Settling
 from capsule_id.motions.sweep import QUANTILES, MotionColumns, SweepPoints, compute, spread_starts
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, by_index
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, by_index, refuse_another_law
 from capsule_id.physics.batches import lanes_of
 from capsule_id.physics.drives import capsule_and_drive
 from capsule_id.physics.model import Initial, without_absent
@@ -208,7 +208,7 @@ def _search(
 
 def _check_search(result: Result, bounds: Values, given: Values, drive: str, faster_than: float | None) -> None:
     """Refuse what cannot be searched."""
-    require_equation_1(result)
+    refuse_another_law(result.provenance.friction)
     if not bounds:
         raise InputError(
             "a search needs the bounds of a setting", "none", "give two values of P_d, Omega, G or another"

@@ -28,7 +28,7 @@ from capsule_id.errors import InputError, writing
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Pointwise, Posterior, Result, held_leaves
 from capsule_id.output import as_utf8, publish, work_in_progress, write_file
-from capsule_id.parameters import TABLE, Name
+from capsule_id.parameters import TABLE, Name, refuse_another_law
 from capsule_id.report.columns import columns_of, errors_left_out
 from capsule_id.report.figures.style import own_style
 from capsule_id.report.html import pictures, render
@@ -380,7 +380,7 @@ def data_tree(result: Result) -> xr.DataTree:
     # Exact masses stand among the draws as constants, so that whoever computes with draws has them all in one place.
     columns = dict(zip(posterior.names, np.moveaxis(_by_chain(posterior.draws), -1, 0), strict=True))
     stated = _constants(result, columns)
-    held = {name: x for name in ("reaction", "slope", "N0", "lag") if (x := stated.get(name))}
+    held = {name: x for name in ("reaction", "slope", "N0", "lag", "ratio", "v_s") if (x := stated.get(name))}
     held |= result.fixed
     columns |= {name: np.full((chains, draws), value, np.float64) for name, value in held.items()}
     about_lp = {"units": "1", "meaning": "log-posterior density, unconstrained space"}
@@ -403,7 +403,11 @@ def data_tree(result: Result) -> xr.DataTree:
             "posterior_predictive": replicates.assign_coords(thinned),
         }
     tree = xr.DataTree.from_dict({name: group for name, group in groups.items() if group.data_vars})
-    tree.attrs = {"rig": result.rig.name, "synthetic": int(result.rig.synthetic)}
+    tree.attrs = {
+        "rig": result.rig.name,
+        "synthetic": int(result.rig.synthetic),
+        "friction": result.provenance.friction,
+    }
     return tree
 
 
@@ -521,7 +525,7 @@ def read_draws(path: Path, count: int, seed: int) -> dict[str, np.ndarray]:
     Raises
     ------
     InputError
-        No file of fit-params, or fewer draws than wanted.
+        No file of fit-params, one of another friction law, or fewer draws than wanted.
     """
     rule, remedy = "--posterior takes the posterior.nc of a result", "give results/<rig>/posterior.nc"
     with (
@@ -530,6 +534,8 @@ def read_draws(path: Path, count: int, seed: int) -> dict[str, np.ndarray]:
     ):
         columns = _members_of(file["posterior"])
         size = next(iter(columns.values())).size
+        law = str(file.attrs.get("friction", "eq. (1)"))
+    refuse_another_law(law, path)
     if not 1 <= count <= size:
         raise InputError(
             "--draws must lie between 1 and the draws of the file", str(count), f"give at most {size}", path

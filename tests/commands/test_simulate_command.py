@@ -59,7 +59,7 @@ def test_netcdf_carries_units_and_parameters(tmp_path: Path) -> None:
         assert float(data.Y2[0]) == 0.1
 
 
-def test_parameters_of_a_result(tmp_path: Path) -> None:
+def test_parameters_of_a_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = {"k1": {"map": 1500.0, "median": None}, "k2[L60]": {"map": 2e4}, "K": {"map": 20.0}}
     (tmp_path / "parameters.json").write_text(json.dumps({"parameters": rows}), encoding="utf-8")
     parser = argparse.ArgumentParser()
@@ -86,9 +86,18 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     assert command.capsule_values(parser.parse_args(pulses), free=frozenset({"P_off"}))["P_off"] == 0.0
     values = command.capsule_values(parser.parse_args([*pulses, "--P_off", "-1"]))
     assert (values["lag"], values["P_off"]) == (0.006, -1.0)
+    # Constant friction is eq. (1) with ratio 1. Before: refused, with a remedy that needs a law.
+    constant = {"parameters": {**rows, "F_dry": {"map": 0.1}}, "provenance": {"friction": "constant friction"}}
+    constant |= {"fixed": {"ratio": 1.0, "v_s": 1.0}, "trust": "not trusted"}
+    (tmp_path / "parameters.json").write_text(json.dumps(constant), encoding="utf-8")
+    capsys.readouterr()
+    assert command.capsule_values(parser.parse_args([*drive, "--c", "5"]))["ratio"] == 1.0
+    said = capsys.readouterr().err
+    assert "the capsule has no F_dry: its rod is damped by c alone" in said
+    assert "not trusted; look at the failed checks" in said
     other = {"parameters": rows, "provenance": {"friction": "mine.Law"}}
     (tmp_path / "parameters.json").write_text(json.dumps(other), encoding="utf-8")
-    with pytest.raises(InputError, match=r"compute with eq. \(1\).*mine.Law"):
+    with pytest.raises(InputError, match=r"computes with eq. \(1\).*mine.Law"):
         command.capsule_values(parser.parse_args(drive))
     (tmp_path / "parameters.json").write_text("[]", encoding="utf-8")
     with pytest.raises(InputError, match="takes a result"):

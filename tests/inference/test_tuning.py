@@ -241,6 +241,8 @@ def test_the_leaves_that_a_folder_states(tmp_path: Path) -> None:
     assert of(lag, {"drive": "pulses", "lag": Quantity(0.004)})["lag"] is None
     assert of(lag, {"drive": "pulses"})["lag"] is None
     assert of({"normal_force": 3.0}, {})["N0"] == 0.0
+    constant = held_leaves(replace(rig, model=ModelChoices(friction="constant")))
+    assert (constant["ratio"], constant["v_s"]) == (1.0, 1.0)
     assert of({"drive": "square"}, {})["P_off"] is None
 
 

@@ -1,5 +1,6 @@
 """The files of a result: strict JSON in the agreed shape, a table, pictures, a netCDF file that ArviZ opens."""
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -16,7 +17,7 @@ import pytest
 import xarray as xr
 
 from capsule_id.commands.bifurcate import client_of
-from capsule_id.errors import OutputError
+from capsule_id.errors import InputError, OutputError
 from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report import columns
@@ -32,6 +33,7 @@ from capsule_id.report.write import (
     result_files,
     write_result,
 )
+from capsule_id.rig.model import ModelChoices
 from capsule_id.views import Finding
 from tests.report.conftest import COLOURED
 
@@ -381,6 +383,22 @@ def test_exact_members_join_their_family(result: Result, tmp_path: Path) -> None
 def test_netcdf_refusals(result: Result, unsampled: Result) -> None:
     with pytest.raises(ValueError, match="nothing was sampled"):
         data_tree(unsampled)
+
+
+def test_draws_of_a_fit_hold_its_law(result: Result, tmp_path: Path) -> None:
+    """Before: a diagram of constant friction had ratio 0.5, and one of another law had eq. (1) of the paper, not a word."""
+    names = [name for name in result.posterior.names if name != "v_s"] if result.posterior else []
+    assert result.posterior is not None
+    kept = [result.posterior.names.index(name) for name in names]
+    sample = dataclasses.replace(result.posterior, names=tuple(names), draws=result.posterior.draws[..., kept])
+    rig = dataclasses.replace(result.rig, model=ModelChoices(friction="constant"))
+    for law, refused in (("constant friction", False), ("mine.Law", True)):
+        own = dataclasses.replace(result.provenance, friction=law)
+        fit = dataclasses.replace(result, rig=rig, posterior=sample, provenance=own)
+        (tmp_path / "x.nc").write_bytes(netcdf_bytes(data_tree(fit)))
+        with pytest.raises(InputError, match=r"mine\.Law") if refused else contextlib.nullcontext():
+            draws = read_draws(tmp_path / "x.nc", 3, 0)
+            assert (draws["ratio"].tolist(), draws["v_s"].tolist()) == ([1.0] * 3, [1.0] * 3)
 
 
 def test_a_name_alone_joins_the_family(result: Result, tmp_path: Path) -> None:
