@@ -321,6 +321,9 @@ def refuse_another_law(law: str, file: str | Path = "") -> None:
         raise InputError(rule, law, "call capsule_id.simulate(..., friction=law) in Python", file)
 
 
+#: Values of eq. (1) at which the friction is the same at every speed; v_s is then any positive number.
+CONSTANT = {"ratio": 1.0, "v_s": 1.0}
+
 #: The leaves of the model: fields of ``CapsuleParameters``, and those with the fields of the drives.
 CAPSULE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "capsule"}
 LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf is not None}

@@ -86,7 +86,7 @@ def _read(saved: dict[str, Any]) -> _Saved:
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
     texts = (f"{finding['level']:4} {finding['check']}: {finding['text']}" for finding in findings)
     verdict = verdict_text(saved["trust"], [(finding["level"], finding["check"]) for finding in findings])
-    text = "\n".join([table_text(frame, synthetic=synthetic), *texts, verdict])
+    text = "\n".join([table_text(frame, synthetic=synthetic), *texts, *saved.get("not_in_sd", ()), verdict])
     marked = f"{verdict}; {SYNTHETIC.strip('* ')}" if synthetic else verdict
     return _Saved(frame, text, marked, clean, saved["provenance"]["files"])
 

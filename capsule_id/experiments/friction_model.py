@@ -10,7 +10,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.parameters import INSTRUMENT_ERRORS, SAME, Name, Parameter, Prior, parameter
+from capsule_id.parameters import CONSTANT, INSTRUMENT_ERRORS, SAME, Name, Parameter, Prior, parameter
 from capsule_id.physics.forces import CoulombStribeck, Force, FrictionLaw, normal_force, scaled
 from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 
@@ -19,8 +19,6 @@ from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 
 #: Symbols of the leaves that hold the normal force, N, and the gap of a contact, m.
 NORMAL_FORCE, GAP = "N", "G"
-#: Values of eq. (1) at which the friction is the same at every speed; v_s is then any positive number.
-CONSTANT = {"ratio": 1.0, "v_s": 1.0}
 #: Prior draws at which a parameter may change the break-away force.
 PRIOR_DRAWS = 64
 
@@ -298,10 +296,8 @@ def friction_of(rig: Rig, law: type[FrictionLaw] | None = None, contact: type[Fo
 
 
 def has_stated_load(table: Table[Any]) -> bool:
-    """Whether pulls state their normal force, which then holds N0 too."""
-    settings = table.settings
-    stated = "normal_force" in table.columns or getattr(settings, "normal_force", None) is not None
-    return stated and hasattr(settings, "load_is")
+    """Whether a test states its normal force, which then holds N0 too."""
+    return "normal_force" in table.columns or getattr(table.settings, "normal_force", None) is not None
 
 
 def _acting_ground(table: Table[Any]) -> dict[str, Quantity]:

@@ -9,10 +9,10 @@ import numpy as np
 from scipy import optimize, special
 
 from capsule_id.experiments.base import LEVEL, Fitted
-from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
+from capsule_id.experiments.friction_model import FrictionModel, Reversed, model_lines
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.experiments.statistics import of_neighbours, permutation_p
-from capsule_id.parameters import QUANTILE_975, SAME, Parameter, Prior
+from capsule_id.parameters import CONSTANT, QUANTILE_975, SAME, Parameter, Prior
 from capsule_id.physics.forces import CoulombStribeck
 from capsule_id.rig.model import ModelChoices, Quantity
 from capsule_id.views import Finding, Level, after_number

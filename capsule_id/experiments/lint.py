@@ -420,7 +420,7 @@ def lint_times(table: Table[Any], used: slice) -> Iterable[Finding]:
         yield Finding("readings.rounded_times", "warn", {"step": rounding, "file": table.file}, table.label)
 
 
-def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> Iterable[Finding]:
+def lint_channel(table: Table[Any], name: str, used: slice, period: float, switched: bool = False) -> Iterable[Finding]:
     """Report clipped samples, drop-outs and a frozen sensor.
 
     Parameters
@@ -428,6 +428,7 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
     name : of the column
     used : the rows that a fit reads
     period : of the oscillation, s; infinite where it is unknown
+    switched : whether it may rest at its limits and elsewhere: only drop-outs are faults
     """
     column, time = table.columns[name], table["time"]
     values, unit = column.values[used], column.to_display
@@ -436,7 +437,7 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
     values = values * unit if unit != 1.0 else values
     step = median_step(time[used])
     channel = {"column": name, "unit": column.unit}
-    for clipped in clipped_samples(values, period / step):
+    for clipped in () if switched else clipped_samples(values, period / step):
         found = used.start + clipped.rows
         facts = channel | {
             "side": clipped.side,
@@ -448,7 +449,7 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
         }
         yield _fault(table, "readings.clipped", found, "fail", **facts)
     for code, wrong in (("readings.dropouts", dropouts(values)), ("readings.frozen", frozen_samples(values))):
-        if len(wrong):
+        if len(wrong) and not (switched and code == "readings.frozen"):
             found = used.start + wrong
             lines = " ".join(map(str, table.rows[found]))
             facts = channel | {"value": float(values[wrong[0]]), "samples": len(found), "lines": lines}

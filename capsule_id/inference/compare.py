@@ -279,10 +279,14 @@ def _variants(rig: Rig, words: Sequence[str], registry: Registry | None) -> tupl
     choices = {
         name: model
         for name, model in variants_of(rig, words).items()
+        if (model == rig.model or _can_be_read(replace(rig, model=model), kinds))
         # As the rules of sliding friction for rig.toml.
-        if not ("viscous" in model.free and any("normal_force" in own or "speed" not in own for own in slides))
+        and not ("viscous" in model.free and any("normal_force" in own or "speed" not in own for own in slides))
         and (model.friction == "constant" or all("speed" in own for own in slides))
     }
+    if len(choices) == 1:
+        remedy = "compare other words: lag needs pulses, and friction another law than the stated one"
+        raise InputError("--compare needs a variant that the rig can show", ",".join(words), remedy)
     made = [e for e in read if isinstance(e, Progression)]
     if not made:
         raise InputError(
@@ -296,6 +300,14 @@ def _variants(rig: Rig, words: Sequence[str], registry: Registry | None) -> tupl
                 "measure further settings",
             )
     return choices, kinds
+
+
+def _can_be_read(rig: Rig, kinds: Registry) -> bool:
+    """Whether the experiments measure what the model sets free."""
+    try:
+        return bool(make_experiments(rig, "all", kinds))
+    except InputError:
+        return False
 
 
 def _target(rig: Rig, registry: Registry) -> LogPosterior:

@@ -88,7 +88,9 @@ class Candidate:
         rows = [target.parameters[i] for i in located]
         # What belongs to the run of a part is new in a new run too.
         own_names = {e.label, e.shares_noise, *(f"{e.shares_noise}_{column}" for column in e.table.columns)}
-        kept = [row.of not in own_names or (row.physical and isinstance(e, PointTest)) for row in rows]
+        # A spring may have the name of a run.
+        anew = [row.of in own_names and row.symbol != "k2" for row in rows]
+        kept = [not own or (row.physical and isinstance(e, PointTest)) for own, row in zip(anew, rows, strict=True)]
         shared = np.array([row.name in names and keep for row, keep in zip(rows, kept, strict=True)])
         place = [names.index(row.name) for row, keep in zip(rows, shared, strict=True) if keep]
         found = np.zeros((len(draws), len(names), len(names)))
@@ -309,13 +311,17 @@ def twins(known: Values, rig: Rig, kinds: Sequence[Kind], registry: Registry, se
         "priors": rig.priors,
         "plan": rig.plan,
     }
-    return list(make_experiments(replace(read, **own), "all", registry))
+    return list(make_experiments(replace(read, **own), "bench", registry))
 
 
 def lines_of(e: Experiment, kind: Kind) -> str:
     """The entry of rig.toml that reads tests like ``e``: its settings and reading errors, in SI units."""
     columns, own = e.table.columns.values(), fields(e.table.settings)
     stated = {one.name: (one.default, getattr(e.table.settings, one.name)) for one in own}
+    # What belongs to the old record alone, and what [rig] states for every table.
+    of_rig = {key for key in ("slope", "N0") if key in stated and stated[key][1] == getattr(e.rig, key)}
+    of_record = {"releases", *(key for key in ("start", "stop") if not isinstance(stated.get(key, ("", ""))[1], str))}
+    stated = {key: pair for key, pair in stated.items() if key not in of_rig | of_record}
     shown = {
         "kind": json.dumps(kind.name),
         "file": json.dumps(f"{kind.name}_next.csv"),

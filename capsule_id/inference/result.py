@@ -7,8 +7,8 @@ from typing import get_args
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments.friction_model import CONSTANT
 from capsule_id.experiments.kind import Choice, Registry
+from capsule_id.parameters import CONSTANT
 from capsule_id.records.view import RunRecord
 from capsule_id.rig.model import Rig
 from capsule_id.views import Comparison, Finding, ResultTable, Trust

@@ -241,7 +241,8 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
         exact = {
-            **dict.fromkeys(("value", "paper", "map", "mean", "median", "lower", "upper"), value),
+            **dict.fromkeys(("value", "paper", "map"), value),
+            **dict.fromkeys(("mean", "median", "lower", "upper") if posterior else (), value),
             "standard_error": 0.0,
             "sd": 0.0,
             "basis": "point" if posterior is None else "sample",

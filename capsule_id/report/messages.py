@@ -90,7 +90,9 @@ def _conflict(facts: Facts) -> str:
     """The prior, what the rest of the data give, and which entry to look at."""
     name, unit, experiments = facts["name"], facts["unit"], facts["experiments"]
     key, scale = facts["key"], f'scale = {facts["fitted"]:.2g}, unit = "{unit.strip() or 1}"'
-    default = f'median = {facts["fitted"]:.3g}, factor = 10, unit = "{unit.strip() or 1}"'
+    size = abs(facts["fitted"])
+    ends = f"mean = 0, sd = {2.0 * size:.2g}" if facts["signed"] else f"median = {size:.3g}, factor = 10"
+    default = f'{ends}, unit = "{unit.strip() or 1}"'
     source, remedy = {
         "rig": (
             f"{name} of rig.toml" if "[" in name else f"[rig] {name}",
@@ -667,6 +669,13 @@ FIT_MESSAGES: Mapping[str, Message] = {
     ),
     "priors.conflict": Message(
         "priors and data", ok="priors and weighings, {number} in all, agree with the rest of the data", fail=_conflict
+    ),
+    "priors.idle": Message(
+        "priors",
+        warn=(
+            "[prior] {keys} has no effect: the fit has no such parameter. Name it in [model] free, or add a test that "
+            "measures it; else remove the line."
+        ),
     ),
     "priors.tails": Message(
         "boundary effects",

@@ -206,6 +206,10 @@ def _read_priors(
                 raise node.error("a prior of k2 must name a spring of an experiment", key, f"write {name}", of_key=True)
             if not spring:
                 replace(entries, value={key: node.value}).refuse_unknown(known)
+            stated = [getattr(t.settings, key) for t in tables or () if hasattr(t.settings, key)]
+            if stated and all(one is not None for one in stated):
+                rule = f"the prior of {key} is that of the experiments, which state it"
+                raise node.error(rule, "both", f"remove it from [prior], or {key} from the experiments", of_key=True)
             row = rows["k2" if spring else key]
             assert row.prior is not None, "its prior can be stated"
             priors[key] = node.prior(row.unit, row.prior)

@@ -23,18 +23,23 @@ from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 @dataclass(frozen=True)
 class Domain:
-    """An interval of SI values, with both ends where it is ``closed``; ``text`` continues "<name> must ..."."""
+    """An interval of SI values, with both ends where it is ``closed``; ``text`` continues "<name> must ...".
+
+    ``whole``: it holds whole numbers alone.
+    """
 
     text: str
     low: float = -inf
     high: float = inf
     closed: bool = False
+    whole: bool = False
 
     def holds(self, values: np.ndarray | float) -> np.ndarray:
         """Whether each value lies inside, elementwise."""
         values = np.asarray(values)
         ends = (values == self.low) | (values == self.high)
-        return ((values > self.low) & (values < self.high)) | (ends & self.closed & np.isfinite(values))
+        inside = ((values > self.low) & (values < self.high)) | (ends & self.closed & np.isfinite(values))
+        return inside & (values == np.round(values)) if self.whole else inside
 
 
 #: Magnitudes of quantities that a rig may have, SI: their squares and ratios stay far from the limits of float64.
@@ -57,7 +62,7 @@ SHARE = Domain("lie between 0 and 100 %", low=0.0, high=1.0 + ROUNDING, closed=T
 PART = Domain("lie between 0 and 100 %, both excluded", low=0.0, high=1.0)
 ABOVE_ONE = Domain("be greater than 1", low=1.0)
 #: A number of drive periods; the simulation of more takes minutes for each trial.
-PERIODS = Domain("lie between 1 and 100000", low=1.0, high=1e5, closed=True)
+PERIODS = Domain("be a whole number between 1 and 100000", low=1.0, high=1e5, closed=True, whole=True)
 INCLINE = Domain("lie between -90 and 90 deg", low=-pi / 2, high=pi / 2)
 SLOPE_ANGLE = Domain("lie between 0 and 90 deg", low=0.0, high=pi / 2)
 

@@ -188,6 +188,11 @@ def test_report_puts_results_side_by_side(tmp_path: Path, capsys: pytest.Capture
     text = (folders[0] / "parameters.json").read_text(encoding="utf-8")
     saved = json.loads(text)
     mu = saved["parameters"]["mu"]
+    # The table of one result comes with the errors that its sds leave out. Before: without.
+    capsys.readouterr()
+    capsule_id(["report", str(folders[0])])
+    (left_out,) = saved["not_in_sd"]
+    assert left_out in capsys.readouterr().out
     for folder, moved, name in ((folders[1], 5.0, "mu"), (folders[2], 0.5, "v_s")):
         folder.mkdir()
         changed = {**mu, "value": mu["value"] + moved * math.sqrt(2.0) * mu["sd"], "trust": "not trusted"}

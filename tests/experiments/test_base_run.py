@@ -118,6 +118,9 @@ def test_the_stated_normal_force_replaces_the_weight(tmp_path: Path) -> None:
     assert np.allclose(double.predict({**values, "mu": 0.5 * TRUTH["mu"]}, np)[0], seen, rtol=0.0, atol=1e-12)
     # negative control
     assert np.max(np.abs(double.predict(values, np)[0] - seen)) > 1e-4
+    # It holds N0 too. Before: N0 was sampled and acted nowhere.
+    pressed = make_rig(tmp_path / "N0", entry(N0=quantity(1.0, "N", 0.1)), head={"m2": quantity(M2, "kg")})
+    assert not [row.name for row in BaseRun(pressed.tables[0], pressed).parameters if row.symbol == "N0"]
 
 
 def test_a_shaken_record_is_labelled_by_its_relative_motion(tmp_path: Path) -> None:

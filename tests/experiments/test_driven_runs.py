@@ -8,7 +8,8 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.experiments.forced_run.experiment import CapsuleRun, growth
 from capsule_id.experiments.forced_run.start_state import ROD_DAMPING, ROD_FREQUENCY
-from capsule_id.experiments.kind import make_experiments
+from capsule_id.experiments.kind import default_registry, make_experiments
+from capsule_id.experiments.lint import lint
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.physics.drives import Pulses, RecordedDrive
@@ -155,6 +156,22 @@ def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:
     assert largest_residual(run, {"K": 1.1 * K}) > 3.0
 
 
+def test_a_current_that_is_switched_is_no_fault(tmp_path: Path) -> None:
+    """Before: "clipped at its upper limit", and "must be smooth; it jumps", in a run whose fit is right."""
+    current = np.round(1.5 * (np.sin(2.0 * np.pi * TIME / PERIOD) > 0.3), 2)
+    noise = np.round(1e-3 * np.random.default_rng(3).standard_normal(TIME.size), 3)
+    for read in (current, current + noise):
+        write(tmp_path, RecordedDrive(TIME, K * read), 0.0, read, 'drive = "recorded"\n')
+        rig = read_rig(tmp_path)
+        assert not [found.code for found in lint(rig, default_registry(), rig.tables) if found.level == "fail"]
+    # Negative control: a sample that reads 0 alone is a drop-out.
+    read = current + 2.0
+    read[[100, 310, 311]] = 0.0
+    write(tmp_path, RecordedDrive(TIME, K * read), 0.0, read, 'drive = "recorded"\n')
+    rig = read_rig(tmp_path)
+    assert "readings.dropouts" in [found.code for found in lint(rig, default_registry(), rig.tables)]
+
+
 def test_a_lag_near_0_has_a_prior_with_its_mass_there(tmp_path: Path) -> None:
     """Before: a traceback, ZeroDivisionError."""
     write(tmp_path, Pulses(6.0, PERIOD, DUTY), 0.0, None, PULSES.replace("value = 6, sd = 2", "value = 0, sd = 2"))
@@ -180,6 +197,11 @@ RECORDED = 'drive = "recorded"\n'
             RECORDED + 'acceleration_rod_delay_sd = { value = 1, unit = "ms" }\n',
             "acceleration_rod_delay_sd needs a channel",
             RECORDED + 'x_rel_delay_sd = { value = 1, unit = "ms" }\n',
+        ),
+        (
+            RECORDED + 'current_sd = { value = 5, unit = "mA" }\n',
+            "current_sd needs a channel that the motion predicts",
+            RECORDED,
         ),
         # Before: pulses that are always on.
         (PULSES.replace('unit = "%"', 'unit = "1"'), "duty must lie between 0 and 100 %, both excluded", PULSES),

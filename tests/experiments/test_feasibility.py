@@ -1,6 +1,7 @@
 """Feasibility of forced runs: the paper's printed settings, the settings that work, and independent routes to each number."""
 
 import re
+from dataclasses import replace
 
 import bench
 import numpy as np
@@ -190,6 +191,14 @@ def test_runs_of_a_rig_are_judged_each_by_its_own_settings() -> None:
     assert findings["low"]
     assert not findings["high"]
     assert all(found.code != "runs.rough" for found in findings["low"])
+
+
+def test_a_run_that_has_settled_needs_no_time_to_settle() -> None:
+    """Before: "5.8 periods are left after the start has died out", of a record without a start."""
+    run = run_table(4.6, 34.56, 1e-3, seconds=1.6)
+    settled = replace(run, settings=replace(run.settings, start="settled"))
+    short = [[f for f in feasibility(one, TRUTH, F_B) if f.code == "runs.length"] for one in (run, settled)]
+    assert [len(found) for found in short] == [1, 0]
 
 
 def test_the_amplitude_comes_from_the_current_where_it_is_not_stated() -> None:

@@ -22,7 +22,7 @@ from tests.experiments.test_lint_remedies import coarse, found, write
 KINDS = default_registry()
 CONFLICT = {
     "unit": " N", "prior": "about 1", "experiments": "a", "fitted": 2.0, "p": 1e-9, "z": 6.0, "value": 2.0, "sd": 0.1,
-    "informed": 0.9,
+    "informed": 0.9, "signed": False,
 }  # fmt: skip
 
 
@@ -39,6 +39,33 @@ def test_a_conflict_names_prior_only_where_it_can_be_stated(stated: str, key: st
     assert f"in [prior] {key} = {{" in words or not key
     tails = text("priors.tails", "warn", {"names": "noise_sd[d], mu", "keys": key})
     assert ("[prior]" in tails) == bool(key)
+
+
+def test_the_remedy_of_a_signed_parameter_is_a_normal_prior(tmp_path: Path) -> None:
+    """Before: a median and a factor, which [prior] refuses for k_cubic."""
+    facts = {
+        **CONFLICT,
+        "name": "k_cubic",
+        "key": "k_cubic",
+        "unit": " N/m^3",
+        "stated": "",
+        "fitted": -1.3e9,
+        "signed": True,
+    }
+    (line,) = re.findall(r"k_cubic = \{.*?\}", text("priors.conflict", "fail", facts))
+    time = np.arange(400) / 2000.0
+    folder = write(tmp_path, time, bench.released(time, 2e-3), 'stiffness = "cubic"', f"[prior]\n{line}\n")
+    assert read_rig(folder, KINDS).priors["k_cubic"] == Prior("normal", 0.0, 2.6e9)
+
+
+def test_a_prior_without_its_parameter_is_named(tmp_path: Path) -> None:
+    """Before: not a word, and the fit had ratio 0.5 beside [prior] ratio."""
+    time = np.arange(400) / 2000.0
+    ratio = "[prior]\nratio = { median = 0.9, factor = 1.1 }\n"
+    folder = write(tmp_path, time, bench.released(time, 2e-3), 'damping = "viscous"', ratio)
+    result = cid.fit(folder, budget=None)
+    (idle,) = [found for found in result.findings if found.code == "priors.idle"]
+    assert "[prior] ratio has no effect" in result.text(idle)
 
 
 def test_keys_of_priors_are_those_that_rig_toml_accepts(tmp_path: Path) -> None:

@@ -203,6 +203,12 @@ def test_the_sampler_integrates_the_absolute_scatter_alone(folder: Path) -> None
         ("", "must have one amplitude", 'P_on = { value = 1, unit = "N" }'),
         ('drive = "harmonic"\nP_d = { value = 1, unit = "N" }', "a harmonic drive has", 'P_on = { value = 1, unit = "N" }'),
         ('P_d = { value = 1, unit = "N" }', "has the amplitude P_on", 'P_on = { value = 1, unit = "N" }'),
+        # Before: read, and without effect.
+        ('P_on = { value = 1, unit = "N" }\nduty_sd = { value = 5, unit = "%" }', "duty_sd has no effect",
+         'P_on = { value = 1, sd = 0.1, unit = "N" }'),
+        ('P_on = { value = 1, unit = "N" }\nlag = { value = 5, sd = 1, unit = "ms" }\n\n[prior]\n'
+         'lag = { median = 50, factor = 3, unit = "ms" }', "the prior of lag is that of the experiments, which state it",
+         'P_on = { value = 1, unit = "N" }\nlag = { value = 5, sd = 1, unit = "ms" }'),
         ('P_on = { value = 1, unit = "N" }\nlag = { value = -1, unit = "s" }', "lag must be 0 or greater",
          'P_on = { value = 1, unit = "N" }\nlag = { value = 1, unit = "ms" }'),
     ],
@@ -240,10 +246,10 @@ def test_the_discrepancy_is_compared_with_scatter_and_motion(folder: Path, relat
 @pytest.mark.parametrize(
     ("periods", "rule", "value"),
     [
-        ("66.5", "be a whole number", "66.5"),
-        ("1e9", "lie between 1 and 100000", r"1e\+09 1"),
-        ("100001", "lie between 1 and 100000", "100001 1"),
-        ("0", "lie between 1 and 100000", "0 1"),
+        ("66.5", "be a whole number between 1 and 100000", "66.5 1"),
+        ("1e9", "be a whole number between 1 and 100000", r"1e\+09 1"),
+        ("100001", "be a whole number between 1 and 100000", "100001 1"),
+        ("0", "be a whole number between 1 and 100000", "0 1"),
     ],
 )
 def test_periods_that_no_trial_has_are_refused(

@@ -220,6 +220,21 @@ def test_a_law_that_the_readings_of_a_slide_cannot_have_is_not_compared(rig: Rig
     assert "as stated" in names
 
 
+def test_a_variant_that_no_experiment_measures_is_not_compared(rig: Rig) -> None:
+    """Before: an error after the first fit, about a [model] that rig.toml does not have."""
+    (progression,) = rig.tables
+    columns = {("P_d" if name == "P_on" else name): c for name, c in progression.columns.items() if name != "duty"}
+    own = {"drive": "harmonic", "P_on": None, "lag": None}
+    own |= {} if "P_d" in columns else {"P_d": progression.settings.P_on}
+    table = replace(progression, columns=columns, settings=replace(progression.settings, **own))
+    harmonic = replace(rig, tables=(table,), model=ModelChoices())
+    with pytest.raises(InputError, match="--compare needs a variant that the rig can show, lag"):
+        compare._variants(harmonic, ["lag"], None)
+    names = compare._variants(harmonic, ["friction", "lag"], None)[0]
+    assert len(names) > 1
+    assert not any("lag" in model.free for model in names.values())
+
+
 @pytest.mark.full
 def test_too_few_settings_are_named(tmp_path: Path) -> None:
     synthesize_robot(tmp_path / "rig", 1, RobotDesign(PERIODS[:2], np.full(2, 0.3)))

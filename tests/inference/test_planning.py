@@ -20,7 +20,7 @@ from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.planning import Candidate, Plan, next_tests, planned
 from capsule_id.inference.result import Result
 from capsule_id.inference.target import LogPosterior
-from capsule_id.rig.model import Instrument, Quantity, Rig
+from capsule_id.rig.model import Instrument, ModelChoices, Quantity, Rig
 from capsule_id.synthetic import PAPER, Truth, synthesize
 from tests.cli_tools import DATA
 from tests.experiments import bench
@@ -137,11 +137,15 @@ def row_of(plan: Plan, what: str) -> Any:
     return plan.table[plan.table["what"] == what].iloc[0]
 
 
+@pytest.mark.parametrize("label", ["run_1", "stiff"])
 def test_a_part_of_a_run_leaves_the_drive_of_a_new_run_as_unknown_as_the_whole_does(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, label: str
 ) -> None:
-    """Before: phase, amplitude and gap of the old record counted as those of the new run, which told more than they can."""
-    own = table(1, samples=400)
+    """Before: phase, amplitude and gap of the old record counted as those of the new run, which told more than they can.
+
+    A run may have the name of its spring; then its k2 counted as new.
+    """
+    own = replace(table(1, samples=400), label=label)
     part = ForcedRun(own, bench.rig(own)).parts(0.2)[0]
     assert part.label != part.shares_noise == own.label
     target = LogPosterior(part.rig, [part])
@@ -277,6 +281,26 @@ def test_a_slope_of_the_track_counts(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(confirmed, encoding="utf-8")
     sloping, _ = planned(tmp_path, REGISTRY, draws=2)
     assert sloping.loc["mu", "sd / value"] > 1.2 * level.loc["mu", "sd / value"]
+
+
+def test_the_lines_leave_out_what_belongs_to_the_old_record_or_to_the_rig(rig: Rig) -> None:
+    """Before: a second slope of the one track, and a new decay cut to the times of the old one (k1 = 60 for 1420 N/m)."""
+    decay = template(rig.cut("free_vibration_1", start=0.02, stop=0.2), "free_vibration")
+    assert (decay.table.settings.start, decay.table.settings.stop) != (None, None)
+    assert not re.search("^(start|stop) =", planning.lines_of(decay, REGISTRY["free_vibration"]), re.MULTILINE)
+    for of_rig, of_table, printed in ((0.01, 0.01, False), (0.01, 0.02, True), (None, 0.02, True)):
+        push = next(table for table in rig.tables if table.kind == "dynamic_friction")
+        push = replace(push, settings=replace(push.settings, slope=Quantity(of_table, 1e-3)))
+        whole = replace(rig, tables=(push,), slope=None if of_rig is None else Quantity(of_rig, 1e-3))
+        lines = planning.lines_of(template(whole, "dynamic_friction"), REGISTRY["dynamic_friction"])
+        assert ("slope =" in lines) == printed
+
+
+def test_what_the_tests_of_the_rig_measure_may_be_free(rig: Rig) -> None:
+    """Before: an error about a file that is gone, with a remedy that changes the model."""
+    free = replace(rig, model=ModelChoices(free=("viscous", "lag")))
+    (push,) = planning.twins(PAPER, free, [REGISTRY["dynamic_friction"]], REGISTRY, 0)
+    assert "viscous" in push.names_by_key
 
 
 def test_the_lines_name_the_instrument(rig: Rig) -> None:

@@ -88,6 +88,8 @@ def test_settings_of_other_duties_have_panels_of_their_own(result: Result, tmp_p
         ("period [ms],periods [1]\n60,67\n", "the settings must have the drive columns of progression: duty, none"),
         ("period [ms],duty [%],periods [1],distance [mm]\n60,30,67,1\n", "unknown column in progression, 'distance'"),
         ("period [ms],duty [%],periods [1]\n-60,30,67\n", "period must be greater than 0"),
+        # Before: a displacement between those of 50 and 51 periods, which no trial has.
+        ("period [ms],duty [%],periods [1]\n60,30,50.5\n", "periods must be a whole number"),
     ],
 )
 def test_faults_of_the_settings_are_named(result: Result, tmp_path: Path, text: str, rule: str) -> None:

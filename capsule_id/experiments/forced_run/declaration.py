@@ -28,6 +28,8 @@ from capsule_id.views import Facts, Finding, Message, filled_in, stated_p
 #: times the recorded current.
 HARMONIC, BASE, PULSES, SQUARE, RECORDED = DRIVES = ("harmonic", "base", "pulses", "square", "recorded")
 FORCES, SWITCHED = (HARMONIC, PULSES, SQUARE, RECORDED), (PULSES, SQUARE)
+#: Columns that drive a run and are no readings of its motion.
+INPUTS = {BASE: "x_base", RECORDED: "current"}
 
 
 class DriveRule(NamedTuple):
@@ -74,10 +76,10 @@ def _uneven_base(settings: Any, columns: Mapping[str, Column]) -> str:
 
 def _unread(settings: Any, columns: Mapping[str, Column]) -> str:
     """The first stated error of a channel that no reading of the run has: it would have no effect."""
-    inputs = {BASE: "x_base", RECORDED: "current"}
-    read = [name for name, *_ in _CHANNELS if name in columns and name != inputs.get(settings.drive)]
+    read = [name for name, *_ in _CHANNELS if name in columns and name != INPUTS.get(settings.drive)]
     errors = (f"{name}_{error}_sd" for name, *_ in _CHANNELS if name not in read for error in ("gain", "delay"))
-    return next((key for key in errors if getattr(settings, key) is not None), "")
+    idle = [f"{name}_sd" for name, column in columns.items() if name not in read and column.sd is not None]
+    return next(iter([*(key for key in errors if getattr(settings, key) is not None), *idle]), "")
 
 
 def present(*names: str) -> Callable[[Any, Mapping[str, Column]], str]:
@@ -184,12 +186,14 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if samples < FEWEST_IN_PERIOD or periods < 1.0:
         facts = {"file": table.file, "periods": periods, "samples": samples}
         faults.append(Finding("runs.time_scale", "fail", facts, table.label))
+    # What drives a run may rest at its limits, and jump, as it is switched.
+    switched = INPUTS.get(table.settings.drive)
     for name in table.columns:
         # A capsule may rest at an extreme position, which is no clipping.
         if name not in ("time", "x_capsule"):
-            faults += lint_channel(table, name, used, period)
+            faults += lint_channel(table, name, used, period, name == switched)
     faults = faults or [*_columns(table)]
-    if "current" in table.columns and not faults:
+    if "current" in table.columns and not (faults or switched):
         faults += lint_smooth(table, "current", used, period)
     yield from faults
     try:

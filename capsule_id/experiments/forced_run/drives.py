@@ -106,7 +106,8 @@ def feasibility(
             "rate": enough / touch,
         }
     # Few excitation periods are left after the transient.
-    decay, period, wanted = DECAY_TIMES * 2.0 * m1 / c, 2.0 * np.pi / Omega, SETTLED_PERIODS
+    period, wanted = 2.0 * np.pi / Omega, SETTLED_PERIODS
+    decay = 0.0 if table.settings.start == "settled" else DECAY_TIMES * 2.0 * m1 / c
     periods = (float(time[-1] - time[0]) - decay) / period
     if not periods >= wanted:
         found["runs.length"] = {

@@ -13,7 +13,7 @@ from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.lint import USUAL_PERIODS
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.rig.model import Column, Quantity, Rig, Table
-from capsule_id.rig.schema import ColumnRule, Entry, GroundSettings, QuantityRule
+from capsule_id.rig.schema import ColumnRule, GroundSettings, QuantityRule
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
 from capsule_id.views import Finding, Message
 
@@ -105,6 +105,12 @@ def _crowded(settings: ProgressionSettings, columns: Mapping[str, Column]) -> st
     return f"{most} trials" if settings.tails == "heavy" and most > MOST_TRIALS else ""
 
 
+def _idle_error(settings: ProgressionSettings, columns: Mapping[str, Column]) -> str:
+    """The first stated error of a column that is no reading: it would have no effect."""
+    errors = ((f"{c.name}_{key}", getattr(c, key)) for c in columns.values() for key in ("sd", "resolution"))
+    return next((key for key, x in errors if x is not None and not key.startswith("distance")), "")
+
+
 _DUTY = "pulses need a column duty, and a harmonic drive has none"
 #: One amplitude that belongs to the drive, a duty with pulses, and few trials that share a setting with heavy tails.
 DRIVE_RULES = (
@@ -127,21 +133,15 @@ DRIVE_RULES = (
         )
         for drive, own in AMPLITUDE.items()
     ),
+    DriveRule(
+        tuple(AMPLITUDE), _idle_error, "{found}", "{found} has no effect: the fit takes what drives a trial as exact",
+        "{columns}", "remove it; an uncertain amplitude is a setting with an sd, in the place of its column", of_key=True,
+    ),
 )  # fmt: skip
 TAIL_RULE = DriveRule(
     tuple(AMPLITUDE), _crowded, "tails", f"heavy tails need at most {MOST_TRIALS} trials at each setting", "{found}",
     "remove tails; the fit names outlying rows", of_key=True,
 )  # fmt: skip
-
-
-def _check_periods(entry: Entry[ProgressionSettings]) -> None:
-    """Require whole numbers of periods."""
-    periods = entry.table["periods"]
-    wrong = np.flatnonzero(periods != np.round(periods))
-    if len(wrong):
-        row = int(wrong[0])
-        value = f"{periods[row]:g}"
-        raise entry.file.error(row, "periods", "periods must be a whole number", value, "count whole periods")
 
 
 def _lint_settings(table: Table[Any], rig: Rig) -> Iterable[Finding]:
@@ -229,7 +229,7 @@ KIND = Kind(
     sets=(("period", "periods", "distance"), ("f", "periods", "distance")),
     optional=("duty", "P_on", "P_d", "current", "session"),
     settings=ProgressionSettings,
-    rules=(partial(check_drive, DRIVE_RULES), _check_periods, partial(check_drive, (TAIL_RULE,))),
+    rules=(partial(check_drive, DRIVE_RULES), partial(check_drive, (TAIL_RULE,))),
     masses=lambda table: ("m1", "m2"),
     parameters=(SESSION_SD, *SESSIONS, TRIAL_SCATTER, TRIAL_SD, DISCREPANCY),
     bench=False,

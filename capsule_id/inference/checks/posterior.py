@@ -331,7 +331,11 @@ def check_priors(s: SampledFit) -> list[Finding]:
         row = s.target.parameters[s.target.names.index(name)]
         if p * len(found) < LEVEL or (default_scatter(s, row) and conflict["z"] > PRIOR_PULL):
             findings.append(_finding(s, row, conflict, p))
-    return findings or [Finding("priors.conflict", "ok", {"number": len(found)})]
+    findings = findings or [Finding("priors.conflict", "ok", {"number": len(found)})]
+    names = {key for row in s.target.parameters for key in (row.name, row.symbol)}
+    idle = ", ".join(key for key in s.rig.priors if key not in names)
+    whole = {table.kind for table in s.rig.tables} == {e.kind for e in s.experiments}
+    return [*findings, Finding("priors.idle", "warn", {"keys": idle})] if idle and whole else findings
 
 
 def _location(s: SampledFit) -> tuple[np.ndarray, np.ndarray]:
@@ -358,6 +362,7 @@ def _finding(s: SampledFit, row: Parameter, conflict: Mapping[str, float], p: fl
         "is_unit": unit,
         "unit": "" if row.unit == "1" else f" {row.unit}",
         "prior": prior.describe(),
+        "signed": prior.kind == "normal",
         "stated": "rig" if is_stated(name) else "prior" if stated else "scatter" if row.scatter else "",
         "experiments": ", ".join(dict.fromkeys(e.table.label for e in readers)),
         "fitted": s.values[name],
