@@ -111,3 +111,24 @@ def test_coloured_noise_of_a_decay_widens_k1(tmp_path: Path) -> None:
     assert k1["trust"] == "not trusted"
     assert k1["widening"] > 1.0
     assert abs(k1["value"] - K1) < 4.0 * k1["sd"]
+
+
+@pytest.mark.full
+def test_records_that_contradict_each_other_widen_k1(tmp_path: Path) -> None:
+    """The clock of one of three records is 2 % fast. Before: each record agreed with itself, and k1 was widened by 1.1."""
+    time, rng = np.arange(800) / 2000.0, np.random.default_rng(1)
+    words = {"damping": '"viscous"', "stiffness": '"linear"', "noise": '"white"', "drift": '"none"', "thin": "1"}
+    entries = [
+        Entry(
+            "free_vibration",
+            f"d{i}",
+            {"time [s]": fast * time, "x_rel [mm]": 2e3 * released(time, 1e-3) + 0.01 * rng.standard_normal(800)},
+            words,
+        )
+        for i, fast in enumerate((1.0, 1.0, 1.02))
+    ]
+    k1 = cid.fit(make_rig(tmp_path, *entries, head={"m1": quantity(M1, "kg")}), budget=None).summary.loc["k1"]
+    assert k1["trust"] == "not trusted"
+    assert k1["widening"] > 3.0
+    assert abs(k1["value"] - K1) < 2.0 * k1["sd"]
+    assert abs(k1["value"] - K1) > 3.0 * k1["sd_unwidened"]
