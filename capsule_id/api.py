@@ -266,15 +266,10 @@ class Fit(Result):
         stated = {name: x for name, x in held_leaves(self.rig).items() if x is not None}
         values = {**stated, **self.fixed, "k2": 0.0, "G": gap, **chosen, **(given or {})}
         _warn_of_another_model(drive, self.rig.model.share_of_reaction, chosen)
-        if spring is not None:
-            springs = by_index("k2", chosen)
-            if spring not in springs:
-                known = ", ".join(springs)
-                raise InputError("spring must be a fitted one", repr(spring), f"choose from {known or 'none'}")
-            values["k2"] = springs[spring]
         if unknown := {*(given or {})} - {*CAPSULE_LEAVES}:
             rule = "given must name leaves of CapsuleParameters"
             raise InputError(rule, repr(min(unknown)), f"choose from {', '.join(CAPSULE_LEAVES)}")
+        values |= {} if spring is None else {"k2": _spring_of(chosen, spring)}
         stiff, near = np.any(np.asarray(values["k2"]) > 0.0), np.all(np.isfinite(values["G"]))
         if stiff != near:
             raise InputError(
@@ -402,6 +397,15 @@ def compare(a: Result, b: Result) -> pd.DataFrame:
                 "give results of fit, or load(DIR)",
             )
     return differences(a.summary, b.summary)
+
+
+def _spring_of(chosen: Mapping[str, np.ndarray], spring: str) -> np.ndarray:
+    """k2 of a fitted spring, (draws,) N/m."""
+    springs = by_index("k2", chosen)
+    if spring not in springs:
+        known = ", ".join(springs)
+        raise InputError("spring must be a fitted one", repr(spring), f"choose from {known or 'none'}")
+    return springs[spring]
 
 
 def _unknown(what: str, word: str, known: Collection[str], near: Sequence[str] = ()) -> InputError:
