@@ -40,7 +40,7 @@ from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
 from capsule_id.inference.tuning import Tuning, tune
 from capsule_id.output import check_directory, replace_file
-from capsule_id.parameters import CAPSULE_LEAVES, by_index, is_stated, refuse_another_law, symbol_of
+from capsule_id.parameters import by_index, is_stated, refuse_another_law, symbol_of
 from capsule_id.physics.forces import Force, FrictionLaw, warn_of_far_gap
 from capsule_id.physics.model import CapsuleParameters, Drive, Trajectory
 from capsule_id.physics.simulation import simulate
@@ -266,18 +266,21 @@ class Fit(Result):
         stated = {name: x for name, x in held_leaves(self.rig).items() if x is not None}
         values = {**stated, **self.fixed, "k2": 0.0, "G": gap, **chosen, **(given or {})}
         _warn_of_another_model(drive, self.rig.model.share_of_reaction, chosen)
-        if unknown := {*(given or {})} - {*CAPSULE_LEAVES}:
-            rule = "given must name leaves of CapsuleParameters"
-            raise InputError(rule, repr(min(unknown)), f"choose from {', '.join(CAPSULE_LEAVES)}")
-        values |= {} if spring is None else {"k2": _spring_of(chosen, spring)}
-        stiff, near = np.any(np.asarray(values["k2"]) > 0.0), np.all(np.isfinite(values["G"]))
-        if stiff != near:
-            raise InputError(
-                "a support spring needs its gap, and a gap its spring",
-                f"k2 alone ({spring!r})" if stiff else "G alone",
-                "give both, spring='NAME' and gap=1e-3, in m, or neither",
-            )
         leaves = fields(CapsuleParameters)
+        names = [leaf.name for leaf in leaves]
+        if unknown := {*(given or {})} - {*names}:
+            raise InputError(
+                "given must name leaves of CapsuleParameters", repr(min(unknown)), f"choose from {', '.join(names)}"
+            )
+        values |= {} if spring is None else {"k2": _spring_of(chosen, spring)}
+        for k, G in (("k2", "G"), ("k2_back", "G_back")):
+            stiff, near = np.any(np.asarray(values.get(k, 0.0)) > 0.0), np.all(np.isfinite(values.get(G, math.inf)))
+            if stiff != near:
+                raise InputError(
+                    "a support spring needs its gap, and a gap its spring",
+                    f"{k if stiff else G} alone" + (f" ({spring!r})" if spring else ""),
+                    "give both, spring='NAME' and gap=1e-3, in m, or neither",
+                )
         if missing := [leaf.name for leaf in leaves if leaf.default is MISSING and leaf.name not in values]:
             raise InputError(
                 "simulate needs every parameter of the capsule",

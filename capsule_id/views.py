@@ -71,7 +71,8 @@ def filled_in(text: str, facts: Facts) -> str:
 #: Checks of what one fault of a record leaves behind: where another check names a fault, they fail with it.
 SYMPTOMS = (
     "residuals.white", "residuals.statistics", "decays.residuals", "decays.halves", "decays.onset", "decays.drift",
-    "decays.hidden", "decays.position", "decays.stiffness", "runs.repeated", "errors.stated", "starts.agree", "model.error",
+    "decays.hidden", "decays.position", "decays.stiffness", "runs.repeated", "errors.stated", "outliers", "starts.agree",
+    "model.error",
 )  # fmt: skip
 #: Warnings that name the cause of failed checks.
 CAUSES = ("decays.changing", "decays.tone")

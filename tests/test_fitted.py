@@ -342,7 +342,7 @@ def test_simulate_names_what_it_lacks(fitted: Fit, capsule: Fit) -> None:
     # Before: no contact, and not a word.
     with pytest.raises(InputError, match=r"spring needs its gap, and a gap its spring, k2 alone \('soft'\)"):
         capsule.simulate(DRIVE, TIMES, draws=5, spring="soft")
-    for wrong in ({"k2": 5e3}, {"G": 1e-3}):
+    for wrong in ({"k2": 5e3}, {"G": 1e-3}, {"k2_back": 5e3}):
         with pytest.raises(InputError, match=r"alone.*, give both, spring='NAME' and gap=1e-3, in m, or neither"):
             capsule.simulate(DRIVE, TIMES, draws=5, given=wrong)
     with pytest.raises(InputError, match=r"given must name leaves of CapsuleParameters, 'k2\[soft\]', choose from m1"):

@@ -14,7 +14,7 @@ from capsule_id.commands import NO_CACHE, PATH, Option
 from capsule_id.console import complain, refusing_damage, say
 from capsule_id.errors import InputError, refusing
 from capsule_id.output import replace_file
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, by_index, refuse_another_law
+from capsule_id.parameters import CAPSULE_LEAVES, CONSTANT, DRIVES, LEAVES, TABLE_1, by_index, refuse_another_law
 from capsule_id.views import counted
 
 # options: Parameters of the capsule and its drive as options, and their values from a result.
@@ -148,6 +148,7 @@ def fitted_values(directory: Path, warn: bool = True) -> dict[str, float | None]
         law, trust = str(saved.get("provenance", {}).get("friction", "eq. (1)")), saved.get("trust")
     # The fitted values hold the free parameters of eq. (1) too.
     refuse_another_law(law, file)
+    values = (CONSTANT if law.startswith("constant") else {}) | values
     lost = [name for name in ("F_dry", "c_q") if name in values]
     if warn and lost:
         complain(f"{file}: the capsule has no {' and no '.join(lost)}: its rod is damped by c alone")

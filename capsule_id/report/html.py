@@ -465,12 +465,15 @@ def _faults(result: Result) -> Iterator[tuple[str, str]]:
     causes = [finding for finding in result.findings if finding.cause and finding.experiment]
     followers = defaultdict[str, list[str]](list)
     others = list[Finding]()
+    known = {cause.experiment for cause in causes}
     for one in result.findings:
-        informing = {label for name in one.parameters for label, share in shares.get(name, {}).items() if share > SMALL}
+        shared = ((label, share) for name in one.parameters for label, share in shares.get(name, {}).items())
+        informing = {table.label for table in result.rig.tables} & {label for label, share in shared if share > SMALL}
         places = {one.experiment} if one.experiment else informing
-        place = next((cause.experiment for cause in causes if cause.experiment in places), "")
-        if place and one.level == "fail" and not one.cause:
-            followers[place].append(title_of(one.code, messages))
+        if one.level == "fail" and not one.cause and places and places <= known:
+            followers[next(cause.experiment for cause in causes if cause.experiment in places)].append(
+                title_of(one.code, messages)
+            )
         else:
             others.append(one)
     for level, heading in (("fail", "Correct"), ("warn", "Look at")):

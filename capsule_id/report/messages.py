@@ -673,8 +673,8 @@ FIT_MESSAGES: Mapping[str, Message] = {
     "priors.idle": Message(
         "priors",
         warn=(
-            "[prior] {keys} has no effect: the fit has no such parameter. Name it in [model] free, or add a test that "
-            "measures it; else remove the line."
+            "[prior] {keys} has no effect: the fit has no such parameter. Remove the line, or add what measures it: a test, "
+            "or the word of [model] free or of damping that adds this parameter."
         ),
     ),
     "priors.tails": Message(

@@ -164,7 +164,11 @@ def test_a_current_that_is_switched_is_no_fault(tmp_path: Path) -> None:
         write(tmp_path, RecordedDrive(TIME, K * read), 0.0, read, 'drive = "recorded"\n')
         rig = read_rig(tmp_path)
         assert not [found.code for found in lint(rig, default_registry(), rig.tables) if found.level == "fail"]
-    # Negative control: a sample that reads 0 alone is a drop-out.
+    # Negative controls: a smooth current that is clipped; a sample that reads 0 alone is a drop-out.
+    clipped = np.clip(1.5 * np.sin(2.0 * np.pi * TIME / PERIOD), -1.0, 1.0)
+    write(tmp_path, RecordedDrive(TIME, K * clipped), 0.0, clipped, 'drive = "recorded"\n')
+    rig = read_rig(tmp_path)
+    assert "readings.clipped" in [found.code for found in lint(rig, default_registry(), rig.tables)]
     read = current + 2.0
     read[[100, 310, 311]] = 0.0
     write(tmp_path, RecordedDrive(TIME, K * read), 0.0, read, 'drive = "recorded"\n')

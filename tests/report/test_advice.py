@@ -133,6 +133,18 @@ def test_the_cause_of_failed_checks_is_the_first_step(tmp_path: Path, fault: obj
     assert not [text for text in steps[1:] if "white" in text or "like random noise" in text]
 
 
+def test_a_bend_explains_the_rows_at_its_ends(tmp_path: Path) -> None:
+    """Before: the first step was to remove the rows that stand off a straight line."""
+    x = np.linspace(1.0, 8.0, 12)
+    words = {"spring": '"a"', "force_sd": quantity(0.02, "N"), "deflection_sd": quantity(0.002, "mm")}
+    entry = Entry("support_spring", "s", {"deflection [mm]": x, "force [N]": 5.0 * x + 0.3 * x**2}, words)
+    result = cid.fit(make_rig(tmp_path, entry, head={"m1": quantity(M1, "kg", 5e-5)}), budget=None)
+    assert "outliers" in result.failed
+    (first, *_) = [text for heading, text in next_steps(result) if heading.startswith("Correct")]
+    assert "expected a straight line" in first
+    assert "outliers" in first.partition(")")[0]
+
+
 def test_a_cause_explains_its_own_experiment_alone(result: Result) -> None:
     """Negative control; a finding about a parameter belongs to the experiments that inform it."""
     spike = Finding(
@@ -141,7 +153,10 @@ def test_a_cause_explains_its_own_experiment_alone(result: Result) -> None:
     white = Finding("starts.agree", "fail", {}, "free_vibration_1")
     forces = Finding("model.error", "fail", {"factors": [("c", 40.0, 6)]}, parameters=("c",))
     shares = {"c": {"free_vibration_1": 0.9, "motor_current": 0.01}}
-    known = replace(result, point_fit=replace(result.point_fit, shares=shares))
+    known = replace(result, rig=cid.read_rig(DATA), point_fit=replace(result.point_fit, shares=shares))
+    two = replace(known, findings=(replace(spike, experiment="free_vibration_1"), forces))
+    two = with_shares(two, c={"free_vibration_1": 0.5, "free_vibration_2": 0.5})
+    assert "Correct c" in dict(next_steps(two))
     for place, headings in (
         ("motor_current", ["Correct experiment motor_current", "Correct experiment free_vibration_1", "Correct c"]),
         ("free_vibration_1", ["Correct experiment free_vibration_1"]),

@@ -28,8 +28,6 @@ from capsule_id.views import Facts, Finding, Message, filled_in, stated_p
 #: times the recorded current.
 HARMONIC, BASE, PULSES, SQUARE, RECORDED = DRIVES = ("harmonic", "base", "pulses", "square", "recorded")
 FORCES, SWITCHED = (HARMONIC, PULSES, SQUARE, RECORDED), (PULSES, SQUARE)
-#: Columns that drive a run and are no readings of its motion.
-INPUTS = {BASE: "x_base", RECORDED: "current"}
 
 
 class DriveRule(NamedTuple):
@@ -76,7 +74,8 @@ def _uneven_base(settings: Any, columns: Mapping[str, Column]) -> str:
 
 def _unread(settings: Any, columns: Mapping[str, Column]) -> str:
     """The first stated error of a channel that no reading of the run has: it would have no effect."""
-    read = [name for name, *_ in _CHANNELS if name in columns and name != INPUTS.get(settings.drive)]
+    inputs = {BASE: "x_base", RECORDED: "current"}
+    read = [name for name, *_ in _CHANNELS if name in columns and name != inputs.get(settings.drive)]
     errors = (f"{name}_{error}_sd" for name, *_ in _CHANNELS if name not in read for error in ("gain", "delay"))
     idle = [f"{name}_sd" for name, column in columns.items() if name not in read and column.sd is not None]
     return next(iter([*(key for key in errors if getattr(settings, key) is not None), *idle]), "")
@@ -140,7 +139,7 @@ DRIVE_RULES = (
     ),
     DriveRule(
         DRIVES, _unread, "{found}", "{found} needs a channel that the motion predicts", "{columns}",
-        "remove it; the gain of a current that drives the run belongs to K", of_key=True,
+        "remove it; the gain of a current that drives the run belongs to K, an error of the times to clock", of_key=True,
     ),
     DriveRule(
         SWITCHED, present("current"), "drive", 'drive = "{drive}" has no column current', "{columns}",
@@ -171,6 +170,8 @@ DRIVE_RULES = (
 
 #: Harmonics of the drive that are compared, and the smallest share of the acceleration's standard deviation there.
 HARMONICS, STRONG = range(1, 6), 0.15
+#: A change from sample to sample, relative to the range, by which a current is switched.
+SWITCH = 0.3
 #: Admissible ratio of the recorded acceleration to that of x_rel alone: the motion of the capsule is unknown.
 RATIO_OF_X_REL = (0.1, 10.0)
 
@@ -186,12 +187,13 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if samples < FEWEST_IN_PERIOD or periods < 1.0:
         facts = {"file": table.file, "periods": periods, "samples": samples}
         faults.append(Finding("runs.time_scale", "fail", facts, table.label))
-    # What drives a run may rest at its limits, and jump, as it is switched.
-    switched = INPUTS.get(table.settings.drive)
+    # A current that is switched in every period rests at its limits, and jumps.
+    current = table["current"] if table.settings.drive == RECORDED else np.zeros(2)
+    switched = np.sum(np.abs(np.diff(current)) > SWITCH * np.ptp(current)) >= max(periods, 1.0)
     for name in table.columns:
         # A capsule may rest at an extreme position, which is no clipping.
         if name not in ("time", "x_capsule"):
-            faults += lint_channel(table, name, used, period, name == switched)
+            faults += lint_channel(table, name, used, period, switched and name == "current")
     faults = faults or [*_columns(table)]
     if "current" in table.columns and not (faults or switched):
         faults += lint_smooth(table, "current", used, period)

@@ -105,12 +105,6 @@ def _crowded(settings: ProgressionSettings, columns: Mapping[str, Column]) -> st
     return f"{most} trials" if settings.tails == "heavy" and most > MOST_TRIALS else ""
 
 
-def _idle_error(settings: ProgressionSettings, columns: Mapping[str, Column]) -> str:
-    """The first stated error of a column that is no reading: it would have no effect."""
-    errors = ((f"{c.name}_{key}", getattr(c, key)) for c in columns.values() for key in ("sd", "resolution"))
-    return next((key for key, x in errors if x is not None and not key.startswith("distance")), "")
-
-
 _DUTY = "pulses need a column duty, and a harmonic drive has none"
 #: One amplitude that belongs to the drive, a duty with pulses, and few trials that share a setting with heavy tails.
 DRIVE_RULES = (
@@ -134,7 +128,9 @@ DRIVE_RULES = (
         for drive, own in AMPLITUDE.items()
     ),
     DriveRule(
-        tuple(AMPLITUDE), _idle_error, "{found}", "{found} has no effect: the fit takes what drives a trial as exact",
+        tuple(AMPLITUDE),
+        lambda settings, columns: next((f"{name}_sd" for name, c in columns.items() if c.sd and name != "distance"), ""),
+        "{found}", "{found} has no effect: the fit takes what drives a trial as exact",
         "{columns}", "remove it; an uncertain amplitude is a setting with an sd, in the place of its column", of_key=True,
     ),
 )  # fmt: skip

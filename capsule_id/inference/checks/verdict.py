@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -279,10 +280,10 @@ def widenings(s: SampledFit) -> dict[str, Widening]:
         return {}
     found: dict[str, Widening] = {}
     for division in (by_phase, by_load, *(partial(by_time, number=i) for i in range(FEWEST_PARTS, MOST_PARTS + 1))):
-        part = parts_of_residuals(s, tests, division)
+        parts = normal_equations(jacobian, residuals, parts_of_residuals(s, tests, division))
         for k, (i, name) in enumerate((i, s.target.names[i]) for i in located):
             largest_sd = LARGEST_RELATIVE_SD * (1.0 if s.target.positive[i] else abs(s.fit.u[i]))
-            pairs = steps_of_parts(jacobian, residuals, k, part) if name in informed else []
+            pairs = steps_of_parts(parts, k) if name in informed else []
             pairs = [pair for pair in pairs if pair[1] < largest_sd]
             one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
             if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
@@ -364,35 +365,51 @@ def parts_of_residuals(s: SampledFit, tests: Sequence[Experiment], division: Div
     return np.concatenate([*parts, np.full(s.target.dimension, PRIORS)])
 
 
-def steps_of_parts(
-    jacobian: Float[np.ndarray, "m d"], residuals: Float[np.ndarray, " m"], k: int, part: Int[np.ndarray, " m"]
-) -> list[tuple[float, float]]:
+class Parts(NamedTuple):
+    """Normal equations of the parts of the data, in units of the columns of the Jacobian.
+
+    ``scale`` (d,) of these units; ``numbers`` (p,) of the parts; ``matrices`` (p, d, d); ``gradients`` (p, d).
+    """
+
+    scale: np.ndarray
+    numbers: np.ndarray
+    matrices: np.ndarray
+    gradients: np.ndarray
+
+
+def normal_equations(
+    jacobian: Float[np.ndarray, "m d"], residuals: Float[np.ndarray, " m"], part: Int[np.ndarray, " m"]
+) -> Parts:
+    """Normal matrix and gradient of every part: a rig may have thousands of parts and 1e5 residuals."""
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
+    order = np.argsort(part, kind="stable")
+    numbers, first = np.unique(part[order], return_index=True)
+    jacobian, residuals = jacobian[order] / scale, residuals[order]
+    pieces = [slice(*ends) for ends in pairwise([*first, len(order)])]
+    matrices = np.array([jacobian[rows].T @ jacobian[rows] for rows in pieces])
+    return Parts(scale, numbers, matrices, np.array([jacobian[rows].T @ residuals[rows] for rows in pieces]))
+
+
+def steps_of_parts(parts: Parts, k: int) -> list[tuple[float, float]]:
     """Gauss-Newton step of parameter k and its sd from every part that informs it.
 
     A part meets the other parameters as the rest of the data gives them: the fit to all of the data has adapted them
     to the misfit of the part itself. A part without which the fit has no solution, or one less certain than the part, gives
     no step: the first period of a strong decay holds most of what the record tells.
     """
-    scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
-    jacobian, numbers = jacobian / scale, np.unique(part)
-    members = [part == number for number in numbers]
-    # The normal matrix and the gradient of every part: a rig may have thousands of parts and 1e5 residuals.
-    matrices = np.array([jacobian[rows].T @ jacobian[rows] for rows in members])
-    gradients = np.array([jacobian[rows].T @ residuals[rows] for rows in members])
     # The derivative with respect to parameter k, the others refitted, as a combination of those of all parameters.
-    whole, unit = np.sum(matrices, axis=0), np.eye(len(scale))[k]
-    own = unit.copy()
-    others = unit == 0.0
+    whole, own = np.sum(parts.matrices, axis=0), np.eye(len(parts.scale))[k]
+    unit, others = own.copy(), own == 0.0
     own[others] = -np.linalg.lstsq(whole[np.ix_(others, others)], whole[others, k], rcond=None)[0]
     pairs = []
-    for number, matrix, gradient in zip(numbers, matrices, gradients, strict=True):
+    for number, matrix, gradient in zip(parts.numbers, parts.matrices, parts.gradients, strict=True):
         rest, information = whole - matrix, own @ matrix @ own
-        if number == PRIORS or not information > 0.0 or np.linalg.matrix_rank(rest, hermitian=True) < len(scale):
+        if number == PRIORS or not information > 0.0 or np.linalg.matrix_rank(rest, hermitian=True) < len(own):
             continue
         effect = unit - own @ matrix / information
         if effect @ np.linalg.solve(rest, effect) > 1.0 / information:
             continue
-        step = -np.linalg.solve(rest, np.sum(gradients, axis=0) - gradient)
+        step = -np.linalg.solve(rest, np.sum(parts.gradients, axis=0) - gradient)
         value = step[k] - own @ (gradient + matrix @ step) / information
-        pairs.append((value / scale[k], information**-0.5 / scale[k]))
+        pairs.append((value / parts.scale[k], information**-0.5 / parts.scale[k]))
     return pairs

@@ -20,6 +20,7 @@ from capsule_id.inference.checks.verdict import (
     PRIORS,
     by_phase,
     by_time,
+    normal_equations,
     parts_of_residuals,
     steps_of_parts,
     widening,
@@ -73,7 +74,9 @@ def pulls(s: SampledFit, misfit: float, divisions: tuple = (by_time, by_phase)) 
         waves = [wave(angle) @ rng.standard_normal(6) for wave in (np.cos, np.sin)]
         residuals[: run.n] = rng.standard_normal(run.n) + misfit * np.sum(waves, axis=0)
         step = inverse @ residuals
-        found = [widening(steps_of_parts(jacobian, residuals - jacobian @ step, k, part)) for part in parts]
+        found = [
+            widening(steps_of_parts(normal_equations(jacobian, residuals - jacobian @ step, part), k)) for part in parts
+        ]
         one = max(found, key=lambda w: w.stretch)
         plain.append(step[k] / sd)
         widened.append(step[k] / (sd * one.stretch) / 1.96)
@@ -139,11 +142,11 @@ def test_a_parameter_that_only_its_prior_determines_does_not_widen_another() -> 
     residuals = np.append(rng.standard_normal(60), [0.0, 0.0])
     residuals -= jacobian @ np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
     part = np.append(np.repeat(np.arange(6), 10), [PRIORS, PRIORS])
-    assert widening(steps_of_parts(jacobian, residuals, 0, part)).factor < 2.0
+    assert widening(steps_of_parts(normal_equations(jacobian, residuals, part), 0)).factor < 2.0
     shared = np.where(part == PRIORS, -1, part)
-    assert len(steps_of_parts(jacobian, residuals, 0, shared)) == 6
+    assert len(steps_of_parts(normal_equations(jacobian, residuals, shared), 0)) == 6
     jacobian[:60, 1] *= 1e8  # the data determine it
-    assert len(steps_of_parts(jacobian, residuals, 0, shared)) == 7
+    assert len(steps_of_parts(normal_equations(jacobian, residuals, shared), 0)) == 7
 
 
 @cache
@@ -180,7 +183,7 @@ def errors_of_decays(misfit: float) -> tuple[np.ndarray, np.ndarray]:
         waves = misfit * rng.standard_normal(half[-1] + 1)[half] * envelope * np.sin(2.0 * np.pi * run.cycles)
         residuals[: run.n] = rng.standard_normal(run.n) + waves
         step = inverse @ residuals
-        one = widening(steps_of_parts(jacobian, residuals - jacobian @ step, k, part))
+        one = widening(steps_of_parts(normal_equations(jacobian, residuals - jacobian @ step, part), k))
         plain.append(step[k] / sd)
         widened.append(step[k] / (sd * one.stretch) / 1.96)
     return np.abs(plain), np.abs(widened)
