@@ -206,8 +206,7 @@ def _read_priors(
                 raise node.error("a prior of k2 must name a spring of an experiment", key, f"write {name}", of_key=True)
             if not spring:
                 replace(entries, value={key: node.value}).refuse_unknown(known)
-            stated = [getattr(table.settings, key, None) for table in tables or ()]
-            if any(one is not None and one.sd for one in stated):
+            if any(getattr(getattr(table.settings, key, None), "sd", 0.0) for table in tables or ()):
                 rule = f"the prior of {key} is that of the experiments, which state it"
                 raise node.error(rule, "both", f"remove it from [prior], or {key} from the experiments", of_key=True)
             row = rows["k2" if spring else key]
