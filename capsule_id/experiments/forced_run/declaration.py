@@ -189,7 +189,7 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         faults.append(Finding("runs.time_scale", "fail", facts, table.label))
     # A current that is switched in every period rests at its limits, and jumps.
     current = table["current"] if table.settings.drive == RECORDED else np.zeros(2)
-    switched = np.sum(np.abs(np.diff(current)) > SWITCH * np.ptp(current)) >= max(periods, 1.0)
+    switched = bool(np.sum(np.abs(np.diff(current)) > SWITCH * np.ptp(current)) >= max(periods, 1.0))
     for name in table.columns:
         # A capsule may rest at an extreme position, which is no clipping.
         if name not in ("time", "x_capsule"):
