@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -102,7 +103,8 @@ def warming(x: np.ndarray) -> np.ndarray:
     return noise + 2.0 * np.exp(-1.5 / (2.0 * M1) * t) * np.cos(np.sqrt(1420.0 / M1) * (t - 0.025 * t**2))
 
 
-FAULTS = {
+Fault = Callable[[np.ndarray], np.ndarray]
+FAULTS: dict[Fault, str] = {
     spikes: "readings.spike",
     clipped: "readings.clipped",
     lost: "readings.jump",
@@ -111,14 +113,11 @@ FAULTS = {
     warming: "decays.changing",
 }
 
-
-TIERS = {spikes: (), lost: pytest.mark.slow, frozen: pytest.mark.slow}
+TIERS: dict[Fault, Any] = {spikes: (), lost: pytest.mark.slow, frozen: pytest.mark.slow}
 
 
 @pytest.mark.parametrize("fault", [pytest.param(fault, marks=TIERS.get(fault, pytest.mark.full)) for fault in FAULTS])
-def test_the_cause_of_failed_checks_is_the_first_step(
-    tmp_path: Path, fault: Callable[[np.ndarray], np.ndarray]
-) -> None:
+def test_the_cause_of_failed_checks_is_the_first_step(tmp_path: Path, fault: Fault) -> None:
     """The other failures of the record follow it in one sentence. Before: each had a step, and a remedy, of its own."""
     time = np.arange(1600) / 2000.0
     x = 2e3 * released(time, 1e-3, c=1.5) + 0.01 * np.random.default_rng(0).standard_normal(1600)
