@@ -93,6 +93,8 @@ def test_parameters_of_a_result(tmp_path: Path, capsys: pytest.CaptureFixture[st
     capsys.readouterr()
     assert command.capsule_values(parser.parse_args([*drive, "--c", "5"]))["ratio"] == 1.0
     said = capsys.readouterr().err
+    (tmp_path / "parameters.json").write_text(json.dumps({**constant, "fixed": {}}), encoding="utf-8")
+    assert command.capsule_values(parser.parse_args([*drive, "--c", "5"]))["ratio"] == 1.0
     assert "the capsule has no F_dry: its rod is damped by c alone" in said
     assert "not trusted; look at the failed checks" in said
     other = {"parameters": rows, "provenance": {"friction": "mine.Law"}}

@@ -66,6 +66,12 @@ def test_a_prior_without_its_parameter_is_named(tmp_path: Path) -> None:
     result = cid.fit(folder, budget=None)
     (idle,) = [found for found in result.findings if found.code == "priors.idle"]
     assert "[prior] ratio has no effect" in result.text(idle)
+    # An exact mass has no interval without a sample either.
+    file = folder / "rig.toml"
+    file.write_text(re.sub(r"(m1 = .*?)sd = [^,]*, ", r"\1", file.read_text(encoding="utf-8")), encoding="utf-8")
+    result = cid.fit(folder, budget=None)
+    assert result.summary.at["m1", "value"] == result.fixed["m1"]
+    assert result.summary.loc["m1", ["mean", "median", "lower", "upper"]].isna().all()
 
 
 def test_keys_of_priors_are_those_that_rig_toml_accepts(tmp_path: Path) -> None:

@@ -140,6 +140,7 @@ def test_a_bend_explains_the_rows_at_its_ends(tmp_path: Path) -> None:
     words = {"spring": '"a"', "force_sd": quantity(0.02, "N"), "deflection_sd": quantity(0.002, "mm")}
     entry = Entry("support_spring", "s", {"deflection [mm]": x, "force [N]": 5.0 * x + 0.3 * x**2}, words)
     result = cid.fit(make_rig(tmp_path, entry, head={"m1": quantity(M1, "kg", 5e-5)}), budget=None)
+    assert result.failed[0] == "linearity"
     assert "outliers" in result.failed
     (first, *_) = [text for heading, text in next_steps(result) if heading.startswith("Correct")]
     assert "expected a straight line" in first

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -18,6 +19,7 @@ from capsule_id.inference.checks import verdict
 from capsule_id.inference.checks.verdict import (
     FEWEST_PARTS,
     PRIORS,
+    by_load,
     by_phase,
     by_time,
     normal_equations,
@@ -147,6 +149,32 @@ def test_a_parameter_that_only_its_prior_determines_does_not_widen_another() -> 
     assert len(steps_of_parts(normal_equations(jacobian, residuals, shared), 0)) == 6
     jacobian[:60, 1] *= 1e8  # the data determine it
     assert len(steps_of_parts(normal_equations(jacobian, residuals, shared), 0)) == 7
+    assert len(steps_of_parts(normal_equations(jacobian, residuals, part), 0)) == 6  # the priors are no part
+
+
+def test_the_step_of_a_part_is_its_own_estimate() -> None:
+    """One parameter: least squares of the rows of each part. Two: the other one from the rest alone."""
+    rng = np.random.default_rng(1)
+    jacobian, residuals, part = rng.standard_normal((40, 2)), rng.standard_normal(40), np.repeat(np.arange(4), 10)
+    for number, (step, sd) in enumerate(steps_of_parts(normal_equations(jacobian[:, :1], residuals, part), 0)):
+        x, y = jacobian[part == number, 0], residuals[part == number]
+        assert (step, sd) == pytest.approx((-(x @ y) / (x @ x), (x @ x) ** -0.5))
+    (first, _), *_ = steps_of_parts(normal_equations(jacobian, residuals, part), 0)
+    rest, own = part != 0, part == 0
+    other = -np.linalg.lstsq(jacobian[rest], residuals[rest])[0]
+    # Score of the efficient derivative at the values from the rest.
+    score = jacobian[:, 0] - jacobian[:, 1] * (jacobian[:, 0] @ jacobian[:, 1]) / (jacobian[:, 1] @ jacobian[:, 1])
+    expected = other[0] - score[own] @ (residuals[own] + jacobian[own] @ other) / (score[own] @ score[own])
+    assert first == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("loads", "parts"),
+    [([1.0, 3.0, 1.0, 3.0], [0, 1, 0, 1]), (list(range(16, 0, -1)), [7 - i // 2 for i in range(16)])],
+)
+def test_a_part_holds_the_trials_of_a_load(loads: list[float], parts: list[int]) -> None:
+    table = SimpleNamespace(loads=(np.array(loads), np.ones(len(loads))))
+    assert cast(np.ndarray, by_load(cast(BaseRun, table))).tolist() == parts
 
 
 @cache
