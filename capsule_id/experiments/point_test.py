@@ -9,7 +9,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -105,6 +105,13 @@ class PointTest(GroundExperiment):
         errors = [column.instrument.errors if column.instrument else {} for column in self.table.columns.values()]
         words = {"gain": "gain", "offset": "zero"}
         return {word for error, word in words.items() if not all(error in stated for stated in errors)}
+
+    def with_readings(self, changed: Mapping[str, np.ndarray], rows: Any = slice(None)) -> Self:
+        """The test with ``rows`` of its table and with other values of some columns."""
+        columns = {name: replace(c, values=changed.get(name, c.values)[rows]) for name, c in self.table.columns.items()}
+        table = replace(self.table, columns=columns, rows=np.arange(1, 1 + len(columns[next(iter(columns))].values)))
+        made: Any = type(self).make(table, self.rig, self.friction)[0]
+        return made
 
     def as_read(self, slope: Any, column: str, theta: ValuesBySymbol) -> Any:
         """A derivative of the true reading by a true column, as the readings of both instruments show it."""
@@ -536,6 +543,10 @@ class Line(PointTest):
         prior = prior if self.n > 2 else replace(prior, spread=SCATTER_FACTOR_OF_FEW)
         scatter = replace(parameter("scatter", table.label, prior), unit=self.unit_of_y)
         return (slope,) if self.scale_known else (slope, scatter)
+
+    def with_readings(self, changed: Mapping[str, np.ndarray], rows: Any = slice(None)) -> Self:
+        """The prior of the intercept stays as wide as the range of the measured readings: a single level has none."""
+        return eqx.tree_at(lambda line: line.width, super().with_readings(changed, rows), self.width)
 
     @property
     def x(self) -> np.ndarray:

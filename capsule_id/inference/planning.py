@@ -13,7 +13,6 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
@@ -188,16 +187,7 @@ def _as_predicted(e: Experiment, values: Values) -> Experiment:
     reading = getattr(e, "reading", "")
     if not isinstance(e, PointTest) or reading not in e.table.columns:
         return e
-    return _remade(e, {reading: e.observed - np.asarray(e.misfit(e.local(values)).raw)}, np.arange(e.n))
-
-
-def _remade(e: PointTest, changed: Mapping[str, np.ndarray], rows: np.ndarray) -> PointTest:
-    """The test with ``rows`` of its table and with other values of some columns."""
-    columns = {name: replace(c, values=changed.get(name, c.values)[rows]) for name, c in e.table.columns.items()}
-    table = replace(e.table, columns=columns, rows=np.arange(1, len(rows) + 1))
-    made: Any = type(e).make(table, e.rig, e.friction)[0]
-    # The prior of an intercept is as wide as the range of the measured readings, which a single level does not have.
-    return eqx.tree_at(lambda line: line.width, made, e.width) if isinstance(e, Line) else made
+    return e.with_readings({reading: e.observed - np.asarray(e.misfit(e.local(values)).raw)})
 
 
 def _repeated(
@@ -206,7 +196,7 @@ def _repeated(
     """The test with so many trials, at most ``MOST_ROWS``, that repeat ``rows``; also the trials that each stands for."""
     n = min(int(number), MOST_ROWS)
     spread = rows if n >= len(rows) else rows[np.linspace(0, len(rows) - 1, n).round().astype(int)]
-    return _remade(e, changed, np.resize(spread, n)), number / n
+    return e.with_readings(changed, np.resize(spread, n)), number / n
 
 
 def _designs(e: PointTest, kind: Kind) -> Iterator[tuple[str, Mapping[str, np.ndarray], np.ndarray]]:

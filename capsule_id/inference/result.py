@@ -160,7 +160,8 @@ class Result:
     registry : kinds of the rig's experiments, which declare the texts of their panels and checks
     summary : a row per physical parameter (index ``name``), SI, missing numbers NaN; columns unit, meaning, value, sd,
         quote, basis, trust, paper, map, standard_error, mean, median, lower, upper, ess, ess_bulk, ess_tail, rhat, informed,
-        widening, and sd, lower and upper without it (sd_unwidened, lower_unwidened, upper_unwidened).
+        widening, and sd, lower and upper without it (sd_unwidened, lower_unwidened, upper_unwidened), not_in_sd (errors of
+        instruments), and largest_error, the one of them that matters most, with the change by 1 % of it.
         Quote value and sd: the median and sd of the sample (basis "sample"), or the maximum and its standard error
         (basis "point"). Where ``quote`` is "interval", quote value, lower and upper: the posterior is skewed
     nuisances : the same columns for scatters and noise

@@ -9,6 +9,7 @@ import pandas as pd
 
 from capsule_id.experiments.friction_model import SurfaceExperiment
 from capsule_id.experiments.kind import Registry, paper_estimates
+from capsule_id.experiments.point_test import PointTest
 from capsule_id.inference.checks.posterior import runs_alone
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
 from capsule_id.inference.curvature import covariance
@@ -192,7 +193,7 @@ def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
 SUMMARY_COLUMNS = (
     "unit", "meaning", "value", "sd", "quote", "basis", "trust", "paper", "map", "standard_error", "mean", "median", "lower",
     "upper", "ess", "ess_bulk", "ess_tail", "rhat", "informed", "widening", "sd_unwidened", "lower_unwidened",
-    "upper_unwidened", "not_in_sd",
+    "upper_unwidened", "not_in_sd", "largest_error",
 )  # fmt: skip
 #: Ratio of the arms of a 95 % interval about the median above which value ± sd does not describe it. A log-normal
 #: distribution has it at a relative sd of 0.35.
@@ -200,6 +201,10 @@ LARGEST_SKEW = 2.0
 #: Of a positive parameter whose 95 % interval ends differ by more than this factor, the readings give an upper limit alone:
 #: the lower end is that of the prior, which cannot reach 0. An undamped record gives c such an interval.
 UPPER_LIMIT = 30.0
+#: Change of k1 and c of free decays by a clock that is wrong by 1 %, in per cent: k1 follows the square of the rate.
+CLOCK = {"k1": 2.0, "c": 1.0}
+#: Words for the errors of the instruments of bench tables, and the smallest change that is said, in per cent.
+ERROR_WORDS, SMALLEST_EFFECT = {"gain": "gain", "offset": "zero"}, 0.05
 #: Nodes of the average over a scatter: the inverse hyperbolic sine of their distance from the fit, in u, is even. Tables
 #: with more rows show their scatter.
 NODES, REACH = 400, 4.0
@@ -213,7 +218,7 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
     paper = paper_estimates(target.experiments, registry)
     paper |= {name: mass.value for name, mass in masses.items() if mass is not None}
     known = informed(target, posterior, point)
-    words = trust_words(sampled, known)
+    words, effects = trust_words(sampled, known), largest_errors(target, point)
     rows: list[tuple[Parameter, dict[str, object]]] = []
     for i, row in enumerate(target.parameters):
         entry: dict[str, Any] = {
@@ -228,6 +233,7 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             "standard_error": at_point[row.name],
             "informed": bool(known[i]),
             "not_in_sd": " ".join(unstated_errors(target, row)),
+            "largest_error": effects.get(row.name, ""),
         }
         if posterior is not None:
             draws = posterior.draws[..., i].ravel()
@@ -252,6 +258,7 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             "meaning": f"{row.meaning} (exact)",
             "informed": True,
             "not_in_sd": "",
+            "largest_error": "",
         }
         rows.append((row, exact))
     physical, nuisances = (
@@ -269,6 +276,42 @@ def unstated_errors(target: LogPosterior, row: Parameter) -> list[str]:
     own = [e for e in target.experiments if measured and any(other.name == row.name for other in e.parameters)]
     found = {word for e in own for word in e.unstated_errors(row.symbol)}
     return [word for word in INSTRUMENT_WORDS if word in found]
+
+
+def largest_errors(target: LogPosterior, fit: PointFit) -> dict[str, str]:
+    """The unstated error of 1 % of one instrument that moves each parameter most, and by how much, by name.
+
+    One instrument reads the columns of one name in all bench tables. Its gain is wrong by 1 %, or its zero by 1 % of its
+    largest reading. The change is one Gauss-Newton step from the fit, of parameters that these tables alone inform. The
+    clock of decays counts too.
+    """
+    values, end, steps = target.mapping(target.theta(fit.u)), 0, dict[str, np.ndarray]()
+    jacobian = linearised(target, fit.u)[1]
+    inverse = np.nan_to_num(covariance(jacobian), posinf=0.0)  # without a covariance there is no step
+    for e in target.experiments:
+        own = e.local(values)
+        before = np.asarray(e.residuals(own, np))
+        rows, end = slice(end, end + len(before)), end + len(before)
+        for name, column in e.table.columns.items() if isinstance(e, PointTest) else ():
+            shifts = {"gain": column.values, "offset": np.full(e.n, np.max(np.abs(column.values)))}
+            stated = column.instrument.errors if column.instrument else {}
+            for error in (error for error in shifts if error not in stated):
+                moved = e.with_readings({name: column.values + 0.01 * shifts[error]})
+                step = 100.0 * inverse @ (jacobian[rows].T @ (np.asarray(moved.residuals(own, np)) - before))
+                of_column = f"{ERROR_WORDS[error]} of {name}"
+                steps[of_column] = steps.get(of_column, 0.0) + step
+    words = dict[str, str]()
+    for row in (row for row in target.parameters if row.physical and row.positive and not is_stated(row.name)):
+        readers = [e for e in target.experiments if any(other.name == row.name for other in e.parameters)]
+        index = target.located.tolist().index(target.names.index(row.name))
+        known = all(isinstance(e, PointTest) for e in readers)
+        sizes = {error: abs(float(step[index])) for error, step in steps.items() if known}
+        if row.symbol in CLOCK and "clock" in unstated_errors(target, row):
+            sizes["clock"] = CLOCK[row.symbol]
+        largest = max(sizes, key=lambda error: np.round(sizes[error], 6), default="")
+        if largest and SMALLEST_EFFECT < sizes[largest] < np.inf:
+            words[row.name] = f"{sizes[largest]:.2g} %: {largest}"
+    return words
 
 
 def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, float]:

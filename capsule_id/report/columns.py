@@ -206,10 +206,6 @@ def skewed_names(frame: pd.DataFrame) -> list[str]:
     return [row.name for row in table_rows(frame) if row.skewed]
 
 
-#: Change of a parameter of bench tests by an error of 1 %, in per cent, where it is the same in every rig.
-EFFECTS = {("clock", "k1"): 2, ("clock", "c"): 1, ("gain", "K"): 1, ("gain", "k2"): 1}
-
-
 def errors_left_out(frame: pd.DataFrame) -> list[str]:
     """A sentence about the errors of instruments that no sd of ``frame`` contains; [] where all are stated."""
     missing = {str(name): str(words).split() for name, words in frame["not_in_sd"].items()}
@@ -219,9 +215,11 @@ def errors_left_out(frame: pd.DataFrame) -> list[str]:
         return []
     parts = "; ".join(f"{word}: {', '.join(names[word])}" for word in found)
     words = " or ".join(filter(None, [", ".join(found[:-1]), found[-1]]))
-    plain = ((word, [(name, EFFECTS.get((word, symbol_of(name)))) for name in names[word]]) for word in found)
-    changes = [(word, " and ".join(f"{name} by {size} %" for name, size in own if size)) for word, own in plain]
-    effects = "".join(f". An error of 1 % in the {word} changes {change}" for word, change in changes if change)
+    largest: dict[str, list[str]] = {}
+    for name, text in frame["largest_error"].items():
+        largest.setdefault(str(text), []).extend([str(name)] * bool(text))
+    moved = "; ".join(f"{', '.join(own)} by {text.replace(': ', ' (', 1)})" for text, own in largest.items() if own)
+    effects = f". An error of 1 % changes {moved}" if moved else ""
     return [
         f"the sd contains no error of {words} ({parts}){effects}. How to state them: guide, parameters, Instruments"
     ]

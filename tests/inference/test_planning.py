@@ -76,7 +76,7 @@ def test_a_line_tells_its_slope_as_the_closed_form_says(rig: Rig) -> None:
 
 def test_pushes_of_one_speed_tell_one_combination_of_mu_and_v_s(rig: Rig) -> None:
     """Against SciPy: the distance by quadrature of u/(g mu(u)), its derivatives by differences."""
-    e = planning._remade(template(rig, "dynamic_friction"), {}, np.zeros(4, int))
+    e = template(rig, "dynamic_friction").with_readings({}, np.zeros(4, int))
     speed, scatter = float(e.table["speed"][0]), 0.015
 
     def friction(u: float, mu: float, v_s: float) -> float:
@@ -170,7 +170,7 @@ def test_the_best_test_is_one_that_reads_the_target(rig: Rig) -> None:
     assert row["tests"] == "20"
     sample = np.log(result.posterior.draws.reshape(-1, len(result.posterior.names)))  # type: ignore[union-attr]
     variance = np.var(sample[:, result.posterior.names.index("K")])  # type: ignore[union-attr]
-    e = planning._remade(template(rig, "motor_current"), {}, np.resize(np.arange(8), 20))
+    e = template(rig, "motor_current").with_readings({}, np.resize(np.arange(8), 20))
     expected = 1.0 / np.sqrt(1.0 + variance * information(e, PAPER, ["K"]).item())
     assert row["K, ratio"] == pytest.approx(expected, rel=0.05)
     assert row["sd of K"] == pytest.approx(plan.today["K"] * row["K, ratio"])
@@ -185,7 +185,7 @@ def test_one_level_tells_nothing_of_a_slope_beside_a_free_intercept(rig: Rig) ->
     # Such a table would be refused, so it is no candidate; its information must be that of none.
     assert not plan.table["what"].str.fullmatch(r"as motor_current, current [\d.]+ A").any()
     whole = template(rig, "motor_current")
-    assert information(planning._remade(whole, {}, np.full(20, 7)), PAPER, ["K"], whole).item() * SD["K"] ** 2 < 0.05
+    assert information(whole.with_readings({}, np.full(20, 7)), PAPER, ["K"], whole).item() * SD["K"] ** 2 < 0.05
     assert plan.table.iloc[0]["what"] == "as motor_current, current 0.25 and 2 A"
 
 

@@ -55,6 +55,7 @@ def _frame(rows: dict[str, tuple[str, str, float, float, float]], rng: np.random
             "sd": sd, "median": mean, "lower": mean - 1.96 * sd, "upper": mean + 1.96 * sd,
             "ess": 4100.0 + 100 * rng.normal(), "ess_bulk": 4050.0, "ess_tail": 4010.0, "rhat": 1.002, **NOT_WIDENED,
             "informed": name not in ("m1", "m2"), "not_in_sd": "" if name in ("m1", "m2") else "gain",
+            "largest_error": "9.3 %: gain of speed" if name == "v_s" else "",
         }  # fmt: skip
     frame = pd.DataFrame.from_dict(table, orient="index")
     frame.index.name = "name"
