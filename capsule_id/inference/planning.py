@@ -401,7 +401,9 @@ def _plan(result: Result, targets: Sequence[str], options: Sequence[Option], lef
     if len(useful) < len(options):
         left_out.append(f"{counted(len(options) - len(useful), 'choice')} that change these sds by less than 1 %")
     options = sorted(useful, key=_worth)
-    today = {name: float(x) for name, x in zip(targets, result.summary["sd"][targets], strict=True)}
+    # Where a check left no number, the tests still narrow its random part.
+    sds = result.summary["sd"].fillna(result.summary["sd_unwidened"])[targets]
+    today = {name: float(sd) for name, sd in zip(targets, sds, strict=True)}
     rows = [_row(members, today, ratios) for members, ratios in options]
     table = pd.DataFrame(rows, index=pd.RangeIndex(1, len(rows) + 1))
     return Plan(table, today, tuple(members for members, _ in options), tuple(left_out), result.registry)

@@ -416,7 +416,7 @@ def table_side_by_side(summaries: Sequence[pd.DataFrame]) -> str:
         ", ".join(str(name) for name, differs in frame["differs"].to_dict().items() if differs) for frame in compared
     ]
     texts = [
-        f"{letter} differs from A in {names or 'no parameter that both have'}"
+        f"{letter} differs from A in {names or 'no parameter with a number in both'}"
         for letter, names in zip(letters[1:], differing, strict=True)
     ]
     chance = f"two fits of equal rigs differ so in any parameter with a probability of {100 * FALSE_ALARMS:.0f} %"

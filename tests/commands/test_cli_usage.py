@@ -204,7 +204,7 @@ def test_report_puts_results_side_by_side(tmp_path: Path, capsys: pytest.Capture
     assert head.split() == ["unit", "A", "B", "C", "B", "−", "A,", "sd", "C", "−", "A,", "sd"]
     assert re.fullmatch(r"mu +1 +0\.\d+ ± 0\.\d+ \(not judged\) +0\.\d+ ± 0\.\d+ \(not trusted\) +– +\+5\.0 +–", first)
     assert re.fullmatch(r"v_s +1 +– +– +0\.\d+ ± 0\.\d+ \(not trusted\) +– +–", second)
-    assert rest[:2] == ["B differs from A in mu", "C differs from A in no parameter that both have"]
+    assert rest[:2] == ["B differs from A in mu", "C differs from A in no parameter with a number in both"]
     assert "shares" not in "".join(rest)
     capsule_id(["report", str(folders[0]), str(folders[0])])
     assert "it shares 2 files with A" in " ".join(capsys.readouterr().out.split())

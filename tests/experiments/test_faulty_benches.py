@@ -94,11 +94,12 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """z of every parameter of the truth that is no mass, those of them that nothing doubts, and the codes of findings."""
+    """z of every parameter of the truth that is no mass, those that nothing doubts, codes of findings, those that failed."""
 
     z: dict[str, float]
     trusted: frozenset[str]
     codes: tuple[str, ...]
+    failed: tuple[str, ...]
     not_in_sd: str
 
 
@@ -114,7 +115,7 @@ def fitted(folder: Path, bench: Bench, rng: Random, kinds: tuple[str, ...]) -> O
     z = ((rows["value"] - truth) / rows["sd"]).to_dict()
     failed = {name for name, word in rows["trust"].items() if word == "not trusted"}
     words = " ".join(rows["not_in_sd"])
-    return Outcome(z, frozenset(z) - doubted - failed, tuple(f.code for f in found), words)
+    return Outcome(z, frozenset(z) - doubted - failed, tuple(f.code for f in found), result.failed, words)
 
 
 def outcome(folder: Path, name: str, size: int, stated: bool, seed: int) -> Outcome:
@@ -209,4 +210,6 @@ def test_clean_benches_are_covered(tmp_path: Path) -> None:
         bench = laboratory.clean(rng)
         outcomes.append(fitted(tmp_path / str(seed), bench, rng, (*DECAYS, *laboratory.TABLES)))
     check_coverage(outcomes)
-    assert sum(bool(one.codes) for one in outcomes) <= 5
+    assert sum(bool(one.failed) for one in outcomes) <= 5
+    for name in ("mu", "v_s"):  # twelve slides do not always tell the laws of friction apart
+        assert sum(name in one.trusted for one in outcomes) >= 90

@@ -47,10 +47,10 @@ def result_of(rig: Rig, friction: str = "eq. (1)", seed: int = 0) -> Result:
     sd = np.array([SD.get(name, 0.1) for name in centre])
     z = np.random.default_rng(seed).standard_normal((4, 50, 30, len(centre)))
     value = np.array(list(centre.values()))
-    physical = [name for name in centre if name in PAPER]
+    physical, sds = [name for name in centre if name in PAPER], dict(zip(centre, value * sd, strict=True))
     known = {
         "posterior": SimpleNamespace(names=tuple(centre), draws=value * np.exp(sd * z)),
-        "summary": pd.DataFrame({"value": centre, "sd": dict(zip(centre, value * sd, strict=True))}).loc[physical],
+        "summary": pd.DataFrame({"value": centre, **dict.fromkeys(("sd", "sd_unwidened"), sds)}).loc[physical],
         "provenance": SimpleNamespace(friction=friction, experiments="bench"),
     }
     return cast(Any, SimpleNamespace(rig=rig, registry=REGISTRY, fixed={}, **known))
@@ -178,6 +178,14 @@ def test_the_best_test_is_one_that_reads_the_target(rig: Rig) -> None:
     assert not plan.table["kind"].str.contains("free_vibration").any()
     assert re.search(r"\d+ choices that change these sds by less than 1 %", plan.left_out[-1])
     assert next_tests(result, ["K"], minutes=20).table.iloc[0]["K, ratio"] < plan.table.iloc[0]["K, ratio"]
+
+
+def test_a_parameter_without_a_number_has_the_sd_of_its_sample(rig: Rig) -> None:
+    """Before: "nan (x 0.42)"."""
+    result = result_of(rig)
+    expected = next_tests(result, ["K"], minutes=10).table["sd of K"]
+    result.summary.loc["K", "sd"] = np.nan
+    assert next_tests(result, ["K"], minutes=10).table["sd of K"].tolist() == expected.tolist()
 
 
 def test_one_level_tells_nothing_of_a_slope_beside_a_free_intercept(rig: Rig) -> None:
