@@ -155,13 +155,12 @@ ERRORS = {
 def write(bench: Bench, rng: Random, folder: Path, kinds: tuple[str, ...] = ("free_vibration", *TABLES)) -> Path:
     """Write the folder of a bench with tables of ``kinds`` (three decays)."""
     folder.mkdir(parents=True)
-    stated = {
-        "m1": 0.11 * (1.0 + 1e-3 * rng.standard_normal() + bench["m1"]),
-        "m2": 0.53 * (1.0 + 1e-3 * rng.standard_normal()),
-    }
-    sd = {"m1": max(1.1e-4, 0.11 * abs(bench["m1_sd"])), "m2": 5.3e-4}
-    masses = [f'{name} = {{ value = {value:.8f}, sd = {sd[name]:.8f}, unit = "kg" }}' for name, value in stated.items()]
-    text = ["[rig]", 'name = "a"', *masses, *bench.head.splitlines()]
+    text = ["[rig]", 'name = "a"']
+    for name in ("m1", "m2"):
+        sd = float(bench.settings.get(name, "1e-3")) * bench.truth[name]
+        value = bench.truth[name] * (1.0 + bench[name] + 1e-3 * rng.standard_normal())
+        text.append(f'{name} = {{ value = {value:.8f}, sd = {sd:.8f}, unit = "kg" }}')
+    text += bench.head.splitlines()
     for kind in kinds:
         numbers = range(3) if kind == "free_vibration" else [0]
         for number in numbers:

@@ -310,7 +310,8 @@ def largest_errors(target: LogPosterior, fit: PointFit) -> dict[str, str]:
             sizes["clock"] = CLOCK[row.symbol]
         largest = max(sizes, key=lambda error: np.round(sizes[error], 6), default="")
         if largest and SMALLEST_EFFECT < sizes[largest] < np.inf:
-            words[row.name] = f"{sizes[largest]:.2g} %: {largest}"
+            size = f"{sizes[largest]:.2g}" if sizes[largest] < 100.0 else "more than 100"
+            words[row.name] = f"{size} %: {largest}"
     return words
 
 
