@@ -10,7 +10,7 @@ from functools import partial
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 from capsule_id import console
 from capsule_id.commands import add_options
@@ -23,6 +23,11 @@ BAD_INPUT, INTERNAL = 2, 1
 
 class _Parser(argparse.ArgumentParser):
     """Reports wrong usage in one line on standard error, with exit code 2; a mistyped word with the one that it resembles."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # As in Python 3.14: -1e-3 is a value, too.
+        self._negative_number_matcher = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$", re.IGNORECASE)
 
     def error(self, message: str) -> NoReturn:
         if mistyped := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)$", message):

@@ -174,8 +174,8 @@ OPTIONS = {
             "initial state: rest (default), many states, or the last state at the previous value",
             {"choices": ("rest", "states", "forward", "backward", "both"), "default": "rest"},
         ),
-        ("--states", "N", "initial states of --method states (default 16)", {"default": "16"}),
-        ("--seed", "N", "random seed of the initial states and of --draws (default 0)", {"default": "0"}),
+        ("--states", "N", "initial states of --method states (default 16)", {}),
+        ("--seed", "N", "random seed of the initial states and of --draws (default 0)", {}),
         ("--dropped", "N", "excitation periods dropped (default 300)", {"default": "300"}),
         ("--observed", "N", "excitation periods observed (default 48)", {"default": "48"}),
         ("--merge-contacts", "X", "s; contacts separated by less count as one (default 0: off)", {"default": "0"}),
@@ -210,6 +210,9 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(
                 "DATA must have been fitted", f"no {args.result}", "run fit-params on it, or give --result"
             )
+    # What a posterior does not hold is that of its fit, not of Table 1.
+    if args.posterior is not None and (args.posterior.parent / "parameters.json").is_file() and args.result is None:
+        args.result = args.posterior.parent
     free = frozenset(_frequency_leaf(args) if axis.name == "f" else axis.name for axis in axes)
     # The posterior supplies k2.
     values = capsule_values(args, FIG_6_DEFAULTS, free | ({"k2"} if args.posterior is not None else set()))
@@ -272,7 +275,7 @@ def _dataset(
     leaves: dict[str, Any] = dict(values)
     if args.posterior is not None:
         needs_k2 = args.k2 is None and all(axis.name != "k2" for axis in axes)
-        count, seed = whole_number("draws", args.draws or "100"), whole_number("seed", args.seed)
+        count, seed = whole_number("draws", args.draws or "100"), whole_number("seed", args.seed or "0")
         drawn = read_draws(args.posterior, count, seed)
         draws = leaves_of(drawn, args.spring if needs_k2 else None, args.posterior)
         if "k2" not in draws and needs_k2:
@@ -290,7 +293,9 @@ def _dataset(
     if args.method == "rest":
         return sweep.diagram(p, e, over, grid, **plain)
     if args.method == "states":
-        starts = sweep.spread_starts(p, e, whole_number("states", args.states), whole_number("seed", args.seed))
+        starts = sweep.spread_starts(
+            p, e, whole_number("states", args.states or "16"), whole_number("seed", args.seed or "0")
+        )
         return sweep.diagram(p, e, over, grid, starts=starts, **plain)
     directions = ("forward", "backward") if args.method == "both" else (args.method,)
     return sweep.continuation(p, e, over, grid, directions=directions, **plain)
@@ -341,13 +346,13 @@ def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
         raise InputError("a map needs two different quantities", f"{args.over} and {args.second}", "name another one")
     bands = args.posterior is not None
     blocks = len(axes) == 2 or bands
-    alone = "one quantity"
+    alone, method, many = "one quantity", f"--method {args.method}", args.method == "states"
     for wrong, rule, value, remedy in (
         (bands and len(axes) == 2, "--posterior takes one quantity", "--with", "remove --posterior or --with"),
         (
             blocks and args.method != "rest",
             "maps and bands start from rest",
-            f"--method {args.method}",
+            method,
             "remove --method",
         ),
         (
@@ -357,6 +362,9 @@ def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
             "remove it, or add --with or --posterior",
         ),
         (args.resume and not blocks, "--resume is for maps and bands", alone, "remove --resume"),
+        (args.spring is not None and "k2" in names, "--spring chooses k2", "k2 is varied", "remove --spring"),
+        (args.states is not None and not many, "--states needs --method states", method, "remove --states"),
+        (args.seed is not None and not (many or bands), "--seed needs random states or draws", "none", "remove --seed"),
         (args.draws is not None and not bands, "--draws needs --posterior", "there is none", "add --posterior FILE"),
     ):
         if wrong:

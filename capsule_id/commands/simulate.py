@@ -96,6 +96,8 @@ def capsule_values(
             "none",
             "give --result DIR and --G X, in m, or remove --spring",
         )
+    if args.spring is not None and args.k2 is not None:
+        raise InputError("--spring chooses k2", "--k2 is given, too", "remove one of them")
     return values
 
 
@@ -183,6 +185,8 @@ def leaves_of(fitted: Mapping[str, Value], spring: str | None, file: str | Path 
 
 WIDTHS = {"velocity": "m/s", "penetration": "m", "rounding": "fraction of the break-away force", "tolerance": "1"}
 PICTURE_SAMPLES = 20_000
+#: Most samples, and most periods of the drive, of a run.
+MOST_SAMPLES = 10_000_000
 #: Unit and meaning of the columns of a motion, the state first.
 COLUMNS = {
     "X1": ("m", "displacement of the rod"),
@@ -235,6 +239,8 @@ def run(args: argparse.Namespace) -> int:
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
+    for name in (name for name, width in widths.items() if width <= 0.0):
+        raise InputError(f"--{name} must be positive", getattr(args, name), "give a width above 0")
     from capsule_id.physics.drives import capsule_and_drive
     from capsule_id.physics.forces import warn_of_far_gap
 
@@ -279,6 +285,9 @@ def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]
         raise InputError("--periods needs Omega above 0", f"Omega = {float(args.Omega):g}", "give --duration")
     if not end > 0.0:
         raise InputError("the length must be positive", text, "give a positive number")
+    if samples > MOST_SAMPLES or (period is not None and end / period > MOST_SAMPLES):
+        rule = f"a run has at most {MOST_SAMPLES} samples and periods"
+        raise InputError(rule, f"--samples {samples}, {text}", "simulate a shorter part")
     return end, samples
 
 

@@ -194,7 +194,8 @@ def largest_exponent(
     law = friction_law(p, friction)
     T = np.asarray(e.period)
     begin = tuple(np.nan_to_num(x) for x in (X1 - X2, Y1 - Y2, Y2))
-    span = np.stack([np.zeros_like(T), T], axis=1)
+    # A period of a drive that is settled: a lag begins with the force between the pulses.
+    span = T[:, None] * np.array([DROPPED, DROPPED + 1.0])
     grow = partial(_growth, np.int32(periods), np.int32(max_steps))
     growth, status = (np.asarray(x) for x in run_lanes(grow, (p, e, law, begin), span, batched=True))
     return np.where(status <= Status.GRAZING, growth / (periods * T), np.nan), status
@@ -272,7 +273,7 @@ class Settling:
     Raises
     ------
     InputError
-        A number that is negative, or fewer than 3 periods observed.
+        A number that is negative or not whole, or fewer than 3 periods observed.
     """
 
     dropped: int = DROPPED
@@ -289,8 +290,11 @@ class Settling:
             ("observed", REPEATS, f"be at least {REPEATS}", "observe more periods"),
             ("max_steps", 1, "be positive", "give 1 or more"),
         ):
-            if not getattr(self, name) >= least:
-                raise InputError(f"{name} must {rule}", str(getattr(self, name)), remedy)
+            value = getattr(self, name)
+            if not value >= least:
+                raise InputError(f"{name} must {rule}", str(value), remedy)
+            if name != "merge_contacts" and not (np.isfinite(value) and value == int(value)):
+                raise InputError(f"{name} must be a whole number", str(value), "give a whole number")
 
 
 SETTLING = Settling()
@@ -435,10 +439,11 @@ def periods_of(e: PeriodicDrive) -> np.ndarray:
     """
     name = "Omega" if isinstance(e, Excitation) else "period"
     value = np.asarray(getattr(e, name, np.nan))
-    if not np.all(value > 0.0):
+    wrong = ~((value > 0.0) & (value < np.inf))
+    if np.any(wrong):
         remedy = "a response needs a period: use simulate"
         raise InputError(
-            f"{name} must be positive", f"{type(e).__name__} with {value[~(value > 0.0)].ravel()[0]}", remedy
+            f"{name} must be positive and finite", f"{type(e).__name__} with {value[wrong].ravel()[0]}", remedy
         )
     return np.asarray(e.period)
 
@@ -471,7 +476,7 @@ def _describe(state: np.ndarray, Omega: float, contacts: np.ndarray, status: int
     observed = len(contacts)
     advance = (X2[-1] - X2[0]) / observed
     direction = "S" if abs(advance) < STANDING else "F" if advance > 0.0 else "B"
-    period = period_of(X1 - X2, Y1 - Y2, Omega)
+    period = period_of(X1 - X2, Y1 - Y2, Y2, Omega)
     if period == 0:
         return "aperiodic", 0, direction, float(contacts.mean())
     whole = observed // period * period
@@ -479,15 +484,15 @@ def _describe(state: np.ndarray, Omega: float, contacts: np.ndarray, status: int
     return f"P-{period}-{direction}-{per_period}", period, direction, float(per_period)
 
 
-def period_of(x_rel: np.ndarray, rate: np.ndarray, Omega: float) -> int:
-    """Period in excitation periods of points (n,) of the Poincaré section (m, m/s); 0 if they do not repeat.
+def period_of(x_rel: np.ndarray, rate: np.ndarray, Y2: np.ndarray, Omega: float) -> int:
+    """Period in excitation periods of points (n,) of the Poincaré section (m, m/s, m/s); 0 if they do not repeat.
 
     The tolerance is absolute, and for small motions relative to the largest distance from the origin. Periods up to 16
     are searched for that are observed three times.
     """
     scale = SAME_RELATIVE * float(np.max(np.hypot(x_rel, rate / Omega)))
     for n in range(1, min(LONGEST_PERIOD, (len(x_rel) - 1) // REPEATS) + 1):
-        dx, dw = np.abs(x_rel[n:] - x_rel[:-n]), np.abs(rate[n:] - rate[:-n])
+        dx, dw = np.abs(x_rel[n:] - x_rel[:-n]), np.abs([rate[n:] - rate[:-n], Y2[n:] - Y2[:-n]])
         if dx.max() <= min(SAME_POSITION, scale) and dw.max() <= min(SAME_VELOCITY, scale * Omega):
             return n
     return 0

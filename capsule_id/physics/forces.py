@@ -108,6 +108,10 @@ class FrictionLaw(Protocol):
         """Resistance of a capsule that slides towards negative X2, N."""
 
 
+#: A step is short enough for friction that changes over a speed of v_s and of this part of the speed at its start.
+BRAKING = 6.0
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CoulombStribeck:
@@ -164,7 +168,9 @@ class CoulombStribeck:
         u = [jnp.exp(-sigma * v / self.v_s)]
 
         def rate(acceleration: jax.Array, mass: jax.Array) -> jax.Array:
-            return jnp.where(sliding, u[0] * jnp.abs(acceleration) / self.v_s, 0.0) + viscous / mass
+            # The fall of the friction near v_s counts before the capsule is that slow: a step must not pass it.
+            width = self.v_s + jnp.abs(v) / BRAKING
+            return jnp.where(sliding, jnp.abs(acceleration) / width, 0.0) + viscous / mass
 
         def extend(v: Series) -> jax.Array:
             k = len(v) - 1
@@ -443,8 +449,9 @@ def total(terms: Iterable[Any]) -> Any:
 
 def warn_of_far_gap(G: Any, r: Any) -> None:
     """Warn where every gap ``G``, m, is far beyond the motion ``r``, m; an infinite one means no spring."""
-    gap, reach = float(np.min(G)), float(np.nanmax(np.abs(r)))
-    if max(FAR * reach, FAR_GAP) < gap < np.inf:
+    moved = np.abs(np.asarray(r))
+    gap, reach = float(np.min(G)), float(np.max(moved[np.isfinite(moved)], initial=0.0))
+    if np.isfinite(moved).any() and max(FAR * reach, FAR_GAP) < gap < np.inf:
         text = f"the gap is {1e3 * gap:.4g} mm and the largest |x_rel| {1e3 * reach:.3g} mm: no contact. Is it in m?"
         warnings.warn(text, stacklevel=3)
 

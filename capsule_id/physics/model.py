@@ -364,7 +364,7 @@ _SENTENCES = {
     ),
     Status.TOO_MANY_STEPS: (
         "The run was given up because it needs more steps than max_steps; the samples after that point are NaN: "
-        "shorten the run, raise max_steps, or check stiffness and masses."
+        "shorten the run, or check stiffness and masses; in Python max_steps may be larger."
     ),
     Status.INVALID: (
         "The run was not started: a parameter, the excitation, a time or the initial state is not finite or not "

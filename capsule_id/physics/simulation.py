@@ -20,8 +20,8 @@ from capsule_id.physics.model import (
     MAX_STEPS,
     CapsuleParameters,
     Drive,
-    Excitation,
     Initial,
+    PeriodicDrive,
     Status,
     Trajectory,
     pressed,
@@ -156,7 +156,7 @@ class SmoothingBias:
 
 def smoothing_bias(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     smoothing: Smoothing | None = None,
     periods: int = 10,
     semantics: Literal["stick-slip", "eq2"] = "stick-slip",
@@ -168,16 +168,19 @@ def smoothing_bias(
     Raises
     ------
     InputError
-        Without an excitation frequency (Omega = 0 has no period), or periods < 1.
+        Without a period (Omega = 0 has none), or where ``periods`` is no whole number from 1 on.
     """
-    if periods < 1:
-        raise InputError("the bias is measured over at least one period", f"periods = {periods}", "give 1 or more")
+    if periods < 1 or periods != int(periods):
+        raise InputError(
+            "the bias is measured over at least one period, and whole ones", f"periods = {periods}", "give 1 or more"
+        )
     smoothing = smoothing or Smoothing()
     (p, e), _, _ = lanes_of((p, e), np.zeros(1))
-    Omega = np.asarray(e.Omega)
-    if not np.all(Omega > 0.0):
-        raise InputError("the bias is measured per period of the drive", "Omega <= 0", "give Omega > 0, in rad/s")
-    times = (2.0 * np.pi / Omega)[:, None] * np.arange(periods + 1)
+    with np.errstate(divide="ignore"):
+        period = np.asarray(getattr(e, "period", np.nan))
+    if not np.all((period > 0.0) & (period < np.inf)):
+        raise InputError("the bias is measured per period of the drive", "Omega <= 0", "give a drive with a period")
+    times = period[:, None] * np.arange(periods + 1)
     exact = simulate(p, e, times)
     smooth = simulate(p, e, times, model="smooth", semantics=semantics, smoothing=smoothing)
     return SmoothingBias(
@@ -367,7 +370,8 @@ def energy_balance(
     if e.prescribed:
         raise InputError("an energy balance needs a force as drive", type(e).__name__, "give a drive that is a force")
     given = (*without_absent(p, e), friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
-    (p, e, friction, begun), times, batched = lanes_of(given, np.asarray(span))
+    begin, end = span
+    (p, e, friction, begun), times, batched = lanes_of(given, np.asarray((begin, end)))
     law = friction_law(p, friction)
     rows, starts, status = jax.device_get(_recorded(max_steps, p, e, law, begun, times))
     if not all(Status(int(code)).usable for code in status):

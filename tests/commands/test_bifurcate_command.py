@@ -129,6 +129,12 @@ def test_posterior_bands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     np.testing.assert_allclose(quantiles, np.quantile(r.mean_velocity, [0.025, 0.5, 0.975]), rtol=1e-12)
     assert _run(*axis, *SHORT, "--draws", "13", "--k2", "2e4", "--out", "c.nc") == 2
     assert "at most 12" in capsys.readouterr().err
+    # The result beside the posterior states the rest. Before: Table 1, without a word.
+    rows = {name: {"map": 1.0} for name in ("m1", "m2", "k1", "c", "v_s")}
+    saved = {"parameters": rows, "provenance": {"friction": "mine.Law"}}
+    Path("parameters.json").write_text(json.dumps(saved), encoding="utf-8")
+    assert _run(*axis, *SHORT, "--draws", "12", "--k2", "2e4", "--out", "c.nc") == 2
+    assert "mine.Law" in capsys.readouterr().err
 
 
 def test_parameters_of_a_fitted_rig(capsys: pytest.CaptureFixture[str]) -> None:
@@ -174,6 +180,9 @@ def test_measured_runs_are_laid_over_the_diagram() -> None:
         ([*OVER, "--scheduler", "threads"], "--scheduler is for maps"),
         ([*OVER, "--resume"], "--resume is for maps"),
         ([*OVER, "--draws", "5"], "--draws needs --posterior, there is none, add --posterior FILE"),
+        ([*OVER, "--states", "5"], "--states needs --method states, --method rest, remove --states"),
+        ([*OVER, "--seed", "5"], "--seed needs random states or draws, none, remove --seed"),
+        ([*OVER, "--spring", "soft"], "--spring chooses k2, k2 is varied, remove --spring"),
         ([*OVER, "--posterior", "none.nc"], "--posterior takes the posterior.nc"),
         ([*OVER, "--observed", "2"], "observed must be at least 3"),
         ([*OVER, "--merge-contacts", "1"], "less than half a period"),

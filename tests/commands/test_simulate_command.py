@@ -6,10 +6,12 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from PIL import Image
 
+from capsule_id.cli import capsule_id
 from capsule_id.commands import add_options
 from capsule_id.commands import simulate as command
 from capsule_id.errors import InputError
@@ -116,6 +118,14 @@ def test_a_gap_far_beyond_the_motion_is_a_warning_in_mm(tmp_path: Path) -> None:
     assert _run(*DRIVE, "--G", "0.05", *out) == 0
 
 
+def test_a_negative_number_may_have_an_exponent(tmp_path: Path) -> None:
+    """Before: "expected one argument"."""
+    start = ["--initial", "-1e-3", "0", "0", "-2.5E-2", "--slope", "-1e-2"]
+    run = ["simulate", *DRIVE, *start, "--periods", "1", "--samples", "5", "--out", str(tmp_path / "run.csv")]
+    assert capsule_id(run) == 0
+    assert pd.read_csv(tmp_path / "run.csv")["X1 [m]"][0] == -1e-3
+
+
 @pytest.mark.parametrize(
     ("arguments", "rule"),
     [
@@ -125,6 +135,9 @@ def test_a_gap_far_beyond_the_motion_is_a_warning_in_mm(tmp_path: Path) -> None:
         ([*DRIVE, "--velocity", "1e-3"], "exact model has no widths"),
         ([*DRIVE, "--semantics", "eq2"], "stick-slip semantics only"),
         ([*DRIVE, "--samples", "1"], "at least 2"),
+        ([*DRIVE, "--samples", "1e12"], "at most 10000000 samples and periods"),
+        ([*DRIVE, "--periods", "1e9"], "at most 10000000 samples and periods"),
+        ([*DRIVE, "--model", "smooth", "--velocity", "0"], "--velocity must be positive"),
         ([*DRIVE, "--periods", "-1"], "length must be positive"),
         (
             [*DRIVE, "--periods", "1", "--duration", "1"],

@@ -81,13 +81,15 @@ def test_period_is_the_shortest_that_repeats() -> None:
     k = np.arange(49)
     for n in (1, 2, 5, 16):
         x, w = 1e-3 * np.cos(2.0 * np.pi * k / n), 0.02 * np.sin(2.0 * np.pi * k / n)
-        assert period_of(x, w, 30.0) == n
+        assert period_of(x, w, 0.0 * k, 30.0) == n
+        # A capsule that gets faster without end repeats nothing. Before: period n, and a mean velocity.
+        assert period_of(x, w, 0.1 * k, 30.0) == 0
     # A motion of a tenth of a micrometre must repeat to its own scale.
     small = 1e-7 * np.cos(2.0 * np.pi * k / 3)
-    assert period_of(small, 0.0 * small, 30.0) == 3
-    assert period_of(1e-3 * np.cos(k), 0.02 * np.sin(k), 30.0) == 0
-    assert period_of(1e-3 * np.cos(2.0 * np.pi * k / 17), 0.0 * k, 30.0) == 0
-    assert period_of(0.0 * k, 0.0 * k, 30.0) == 1
+    assert period_of(small, 0.0 * small, 0.0 * small, 30.0) == 3
+    assert period_of(1e-3 * np.cos(k), 0.02 * np.sin(k), 0.0 * k, 30.0) == 0
+    assert period_of(1e-3 * np.cos(2.0 * np.pi * k / 17), 0.0 * k, 0.0 * k, 30.0) == 0
+    assert period_of(0.0 * k, 0.0 * k, 0.0 * k, 30.0) == 1
 
 
 def _contacts_a_period(
@@ -139,8 +141,13 @@ def test_errors() -> None:
     p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=2e4, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
     with pytest.raises(InputError, match="Omega must be positive"):
         response(p, Excitation(1.0, 0.0))
+    with pytest.raises(InputError, match="Omega must be positive and finite"):
+        response(p, Excitation(1.0, np.inf))
     with pytest.raises(InputError, match="concrete values"):
         jax.jit(lambda P_d: response(p, Excitation(P_d, 30.0)))(1.0)
     for wrong in ({"dropped": -1}, {"observed": 2}, {"merge_contacts": float("nan")}, {"max_steps": 0}):
         with pytest.raises(InputError, match=f"{next(iter(wrong))} must"):
+            Settling(**wrong)
+    for wrong in ({"observed": 10.5}, {"dropped": np.inf}, {"exponent_periods": 2.5}):
+        with pytest.raises(InputError, match=f"{next(iter(wrong))} must be a whole number"):
             Settling(**wrong)

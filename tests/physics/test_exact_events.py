@@ -1,10 +1,14 @@
 """Awkward starts and awkward instants: on an event, at the threshold, in contact, two events at once, chatter."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
-from capsule_id.physics.simulation import simulate
+from capsule_id.physics.simulation import energy_balance, simulate
 from tests.capsule_cases import Cases, states_of
 
 # The threshold force is 2 N: F_b = mu (m1 + m2) g with round numbers.
@@ -80,6 +84,23 @@ def test_zero_gap_from_rest() -> None:
         t, other = (simulate(q, Excitation(P_d, 40.0), times) for q in (p, near))
         np.testing.assert_allclose(states_of(t), states_of(other), rtol=0.0, atol=1e-9)
         assert int(t.status) == Status.OK
+
+
+@pytest.mark.parametrize(
+    "drive",
+    [Pulses(4.0, 0.2, 0.5, 0.0, phase=np.pi), Pulses(4.0, 0.2, 0.5, 0.0, lag=0.01), Excitation(4.0, 34.56, np.pi / 2)],
+)
+@pytest.mark.parametrize("back", [False, True])
+def test_zero_gap_without_a_rate_until_the_drive_sets_in(drive: Any, back: bool) -> None:
+    """The gap opens and closes where the first force does. Before: the contact was passed (8.3 mm for 5.5 mm)."""
+    gaps = ({"k2": 0.0, "G": 1.0, "k2_back": 20_000.0, "G_back": gap} if back else {"G": gap} for gap in (0.0, 1e-10))
+    times = np.linspace(0.0, 0.6, 7)
+    t, near = (simulate(replace(RIG, **own), drive, times) for own in gaps)
+    assert int(t.status) == Status.OK
+    np.testing.assert_allclose(states_of(t), states_of(near), rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(t.X2, near.X2, rtol=0.0, atol=1e-7)
+    other = {"k2": 0.0, "G": 1.0, "k2_back": 20_000.0, "G_back": 0.0} if back else {"G": 0.0}
+    assert energy_balance(replace(RIG, **other), drive, (0.0, 0.6)).relative_residual < 1e-8
 
 
 def test_stick_slip_chatter_is_resolved() -> None:

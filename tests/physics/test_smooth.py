@@ -269,5 +269,7 @@ def test_usage_errors(cases: Cases) -> None:
         simulate(p, e, [0.0, T], semantics="eq2")
     with pytest.raises(InputError, match="at least one period"):
         smoothing_bias(p, e, periods=0)
+    with pytest.raises(InputError, match=r"whole ones, periods = 2\.5"):
+        smoothing_bias(p, e, periods=2.5)  # type: ignore[arg-type]  # pyright: ignore
     with pytest.raises(InputError, match="Omega <= 0"):
         smoothing_bias(p, replace(e, Omega=0.0))

@@ -375,6 +375,8 @@ SURE_LEAP, SURE_AGREEMENT = 1e-3, 1e-4
 MAX_LEAPS = 100
 # Coefficients of an event function below this part of its size are rounding, where only their sign would matter.
 ROUNDING_NOISE = 1e-14
+# An event function below this at the start of a step has its root there, scaled to size 1; rounding is far smaller.
+PASSED = -1e-9
 # |f| within this many roundings of the break-away force counts as at the threshold; the rate of |f| then decides.
 THRESHOLD_ROUNDINGS = 16.0
 
@@ -463,14 +465,15 @@ def first_event(
     def leap(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         s, kind, going, leaps = carry
         p0, p1 = other.at(s)
-        to_upper = _leap(base + p0, p1, other.rest - other.p2)
+        # An event function that begins below 0 has its root at the start, at no rate: a drive that sets in there.
+        to_upper = jnp.where(sliding & (p0 < PASSED), 0.0, _leap(base + p0, p1, other.rest - other.p2))
         to_lower = jnp.where(sliding, jnp.inf, _leap(base - p0, -p1, other.rest + other.p2))
         tau, sign = jnp.minimum(to_upper, to_lower), jnp.where(to_upper <= to_lower, 1.0, -1.0)
         sure = _sure(base + sign * p0, sign * p1, tau)
         which = jnp.where(sliding, VELOCITY, jnp.where(sign > 0.0, UPPER, LOWER))
         for gap_kind, gap in reversed(list(enumerate(watched, GAP))):
             g0, g1 = gap.at(s)
-            to_gap = _leap(g0, g1, gap.rest - gap.p2)
+            to_gap = jnp.where(g0 < PASSED, 0.0, _leap(g0, g1, gap.rest - gap.p2))
             is_gap, tau = to_gap <= tau, jnp.minimum(to_gap, tau)
             sure, which = jnp.where(is_gap, _sure(g0, g1, tau), sure), jnp.where(is_gap, gap_kind, which)
         arrived = tau <= jnp.where(sure, SURE_LEAP, SAME) * s_end
