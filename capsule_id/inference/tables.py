@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from capsule_id.experiments.free_vibration.turning_points import TurningPoints
 from capsule_id.experiments.friction_model import SurfaceExperiment
 from capsule_id.experiments.kind import Registry, paper_estimates
 from capsule_id.experiments.point_test import PointTest
@@ -281,9 +282,9 @@ def unstated_errors(target: LogPosterior, row: Parameter) -> list[str]:
 def largest_errors(target: LogPosterior, fit: PointFit) -> dict[str, str]:
     """The unstated error of 1 % of one instrument that moves each parameter most, and by how much, by name.
 
-    One instrument reads the columns of one name in all bench tables. Its gain is wrong by 1 %, or its zero by 1 % of its
-    largest reading. The change is one Gauss-Newton step from the fit, of parameters that these tables alone inform. The
-    clock of decays counts too.
+    One instrument reads the columns of one name in all bench tables and turning points. Its gain is wrong by 1 %, or its
+    zero by 1 % of its largest reading. The change is one Gauss-Newton step from the fit, of parameters that these readings
+    alone inform. The clock of decays counts too.
     """
     values, end, steps = target.mapping(target.theta(fit.u)), 0, dict[str, np.ndarray]()
     jacobian = linearised(target, fit.u)[1]
@@ -292,19 +293,20 @@ def largest_errors(target: LogPosterior, fit: PointFit) -> dict[str, str]:
         own = e.local(values)
         before = np.asarray(e.residuals(own, np))
         rows, end = slice(end, end + len(before)), end + len(before)
-        for name, column in e.table.columns.items() if isinstance(e, PointTest) else ():
-            shifts = {"gain": column.values, "offset": np.full(e.n, np.max(np.abs(column.values)))}
+        columns = e.table.columns.values() if isinstance(e, PointTest | TurningPoints) else ()
+        for column in (column for column in columns if column.name != "time"):
+            shifts = {"gain": column.values, "offset": np.full_like(column.values, np.max(np.abs(column.values)))}
             stated = column.instrument.errors if column.instrument else {}
             for error in (error for error in shifts if error not in stated):
-                moved = e.with_readings({name: column.values + 0.01 * shifts[error]})
+                moved = e.with_readings({column.name: column.values + 0.01 * shifts[error]})
                 step = 100.0 * inverse @ (jacobian[rows].T @ (np.asarray(moved.residuals(own, np)) - before))
-                of_column = f"{ERROR_WORDS[error]} of {name}"
+                of_column = f"{ERROR_WORDS[error]} of {column.name}"
                 steps[of_column] = steps.get(of_column, 0.0) + step
     words = dict[str, str]()
     for row in (row for row in target.parameters if row.physical and row.positive and not is_stated(row.name)):
         readers = [e for e in target.experiments if any(other.name == row.name for other in e.parameters)]
         index = target.located.tolist().index(target.names.index(row.name))
-        known = all(isinstance(e, PointTest) for e in readers)
+        known = all(isinstance(e, PointTest | TurningPoints) for e in readers)
         sizes = {error: abs(float(step[index])) for error, step in steps.items() if known}
         if row.symbol in CLOCK and "clock" in unstated_errors(target, row):
             sizes["clock"] = CLOCK[row.symbol]

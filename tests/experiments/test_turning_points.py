@@ -227,7 +227,7 @@ def test_a_force_that_another_one_replaces_is_not_chosen(tmp_path: Path) -> None
     assert all(checked(e)[0].level == "fail" for e in kept)
 
 
-@pytest.mark.parametrize(("offset", "name"), [(0.12, "c_q"), (-0.12, "F_dry")])
+@pytest.mark.parametrize(("offset", "name"), [(0.12, "rest position"), (-0.12, "F_dry")])
 def test_amplitudes_from_another_place_than_the_rest_position_are_no_force(
     tmp_path: Path, offset: float, name: str
 ) -> None:
@@ -238,7 +238,20 @@ def test_amplitudes_from_another_place_than_the_rest_position_are_no_force(
     assert TurningPoints.second_models([e]) == ([e], [])
     forces = checked(e)[0]
     assert (forces.level, forces.facts["name"]) == ("fail", name)
-    assert "Amplitudes must be counted from the rest position" in finding_text(forces, messages_of(default_registry()))
+    text = finding_text(forces, messages_of(default_registry()))
+    found = "a rest position at 0.1" if name == "rest position" else "Amplitudes must be counted from the rest position"
+    assert found in text
+
+
+def test_a_zero_that_is_hardly_seen_leaves_c_unjudged(tmp_path: Path) -> None:
+    """Before: a finding about no parameter, and c trusted beside it."""
+    time, x = turning_points(False, {}, 1)
+    table = folder(tmp_path, time, x + 0.05, 'samples = "turning_points"')
+    (own,) = make_experiments(read_rig(table))
+    forces = checked(cast(TurningPoints, own))[0]
+    assert (forces.level, forces.parameters) == ("warn", ("k1", "c"))
+    # The zero moves c most, and the sentence beside the numbers says so. Before: the clock, by 1 %.
+    assert cid.fit(table, budget=None).summary["largest_error"]["c"].endswith(": zero of x_rel")
 
 
 def test_a_cubic_spring_that_the_slope_refuses_is_not_replaced_by_damping(tmp_path: Path) -> None:

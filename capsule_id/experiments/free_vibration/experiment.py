@@ -76,7 +76,9 @@ def each(code: str, judge: Judge, joined: bool = True) -> Check:
             level = found(len(judged)) if callable(found) else found
             level = level if isinstance(level, str) else "fail" if level * len(judged) < LEVEL else "ok"
             if level != "ok" or not joined:
-                findings.append(Finding(code, level, {"label": e.label, **facts}, e.label))
+                # A doubt that would move a parameter leaves it unjudged.
+                doubtful = ("k1", "c", *e.model.symbols) if level == "warn" and facts.get("moved") else ()
+                findings.append(Finding(code, level, {"label": e.label, **facts}, e.label, doubtful))
         if judged and not findings:
             least = {"p": min(facts["p"] for _, facts, _ in judged)} if "p" in judged[0][1] else {}
             findings.append(Finding(code, "ok", {"labels": listed(e.label for e, *_ in judged), **least}))
@@ -143,6 +145,7 @@ def halves(changes: Changes) -> Check:
         name = max(found, key=lambda name: abs(found[name][2]))
         first, second, z, matters = found[name]
         return {
+            "moved": matters,
             "name": name,
             "first": first,
             "second": second,

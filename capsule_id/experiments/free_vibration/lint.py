@@ -468,6 +468,12 @@ def _halves(facts: Facts) -> str:
 def _forces(facts: Facts) -> str:
     """The force that explains the turning points better, and the line that states it."""
     unit = "" if facts["unit"] == "1" else f" {facts['unit']}"
+    if not facts["line"]:
+        return (
+            f"{facts['label']}: expected amplitudes that are counted from the rest position; a rest position at "
+            f"{facts['value']:.3g}{unit} explains them better ({facts['z']:.1f} sd from 0), and changes c. Subtract it "
+            "(offset of x_rel in columns), or give turning points of both sides."
+        )
     side = (
         " Amplitudes must be counted from the rest position: subtract it, or give both sides."
         if facts["one_side"]

@@ -1,8 +1,9 @@
 """Turning points of a free decay, read one by one: times and positions (``samples = "turning_points"``)."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,6 +47,8 @@ from capsule_id.views import Facts, Finding
 #     -> Student's t of that force, or of the differences between the halves
 
 
+#: The rest position of amplitudes of one side, in the place of a force.
+ZERO = "rest position"
 #: Passes that estimate the noise levels.
 PASSES = 4
 #: Largest number of Gauss-Newton steps, of their bisections, and change, in sds, below which a fit has converged.
@@ -53,7 +56,7 @@ STEPS, BISECTIONS, CONVERGED = 30, 10, 1e-3
 
 
 def further_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset: bool = False) -> Facts | None:
-    """Estimate the force with this parameter beside those of the fit ``theta``, about which the model is linearised.
+    """Estimate the force with this parameter, or ``ZERO``, beside those of the fit, about which the model is linearised.
 
     Parameters
     ----------
@@ -66,17 +69,20 @@ def further_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset
     model gives it, that of the mass included. None for a table that is too short.
     """
     columns, left, symbols = linear(e, theta)
+    zero = np.repeat([-1.0, 0.0], len(e.values))
     if offset and not e.both_sides:
-        columns = np.column_stack([columns, np.repeat([1.0, 0.0], len(e.values))])
+        columns = np.column_stack([columns, zero])
     if len(e.values) < FEWEST_HALF_SWINGS or len(e.values) <= columns.shape[1] + 1:
         return None
     _, own, _ = least_squares(columns, -left, len(e.values))
-    both = np.column_stack([columns, further_sensitivities(e, theta)[symbol]])
+    both = np.column_stack([columns, zero if symbol == ZERO else further_sensitivities(e, theta)[symbol]])
     found, sd, freedom = least_squares(both, -left, len(e.values))
-    pushes, mass = found[-1] <= 0.0 and symbol != "k_cubic", relative_sd_of_mass(e)
+    pushes, mass = found[-1] <= 0.0 and symbol not in ("k_cubic", ZERO), relative_sd_of_mass(e)
     moved = any(abs(found[k]) > np.hypot(own[k], mass * theta[name]) for k, name in enumerate(symbols))
     value, z = (0.0, 0.0) if pushes else (float(found[-1]), as_normal(found[-1] / sd[-1], freedom))
-    return {"name": symbol, "value": value, "unit": parameter(symbol).unit, "z": z, "moved": moved and not pushes}
+    x_rel = e.table.columns["x_rel"]
+    value, unit = (value * x_rel.to_display, x_rel.unit) if symbol == ZERO else (value, parameter(symbol).unit)
+    return {"name": symbol, "value": value, "unit": unit, "z": z, "moved": moved and not pushes}
 
 
 def linear(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Float[np.ndarray, "m p"], np.ndarray, tuple[str, ...]]:
@@ -209,13 +215,14 @@ def check_steps(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding]
 
 
 def forces(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Facts, Graded] | None:
-    """Judge whether a further force of the decay explains the turning points better than the fitted model."""
-    found = [one for symbol in e.model.absent if (one := further_force(e, theta, symbol))]
+    """Judge whether a further force, or another zero of one side, explains the turning points better than the fitted model."""
+    names = (*e.model.absent, *([] if e.both_sides else [ZERO]))
+    found = [one for symbol in names if (one := further_force(e, theta, symbol))]
     if not found:
         return None
     best = max(found, key=lambda one: one["z"])
     key = "stiffness" if best["name"] == "k_cubic" else "damping"
-    line = e.model.with_force(best["name"]).lines(key)
+    line = "" if best["name"] == ZERO else e.model.with_force(best["name"]).lines(key)
     facts = {**best, "line": line, "model": e.model.name, "one_side": not e.both_sides}
     return facts, graded(best["z"], best["moved"])
 
@@ -335,6 +342,11 @@ class TurningPoints(Decay):
     def unstated_errors(self, symbol: str) -> set[str]:
         """Those of one side are amplitudes, counted from a zero that the readings do not show."""
         return super().unstated_errors(symbol) | (set() if self.both_sides else {"zero"})
+
+    def with_readings(self, changed: Mapping[str, np.ndarray]) -> Self:
+        """The turning points with other values of some columns."""
+        columns = {name: replace(c, values=changed.get(name, c.values)) for name, c in self.table.columns.items()}
+        return self.with_model(self.model, table=replace(self.table, columns=columns))
 
     @property
     def lines(self) -> str:
