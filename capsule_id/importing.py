@@ -398,6 +398,7 @@ def _entry(found: FoundLayout, guessed: Guess | None, content: bytes, kinds: Map
         *labels,
         *_setting_lines(found, guessed, kind),
         *_column_lines(found, guessed, kind),
+        *_load_lines(found, guessed, kind),
     ]
     return "\n".join(lines) + "\n"
 
@@ -422,11 +423,16 @@ def _unused_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[st
     more = f" and {counted(len(names) - _SHOWN_COLUMNS, 'more column')}" if len(names) > _SHOWN_COLUMNS else ""
     if names:
         yield f"#: Not used: {', '.join(names[:_SHOWN_COLUMNS])}{more}."
+
+
+def _load_lines(found: FoundLayout, guessed: Guess, kind: Kind) -> Iterable[str]:
+    """A line to be decided where a mass beside forces of friction may be what presses the capsule down."""
+    used = {each.index for column in guessed.columns.values() for each in (column, *column.rivals)}
     weighed = [(i, unit_of(found.header(i, ["kg"])[1], ["kg"])) for i in found.columns if i not in used]
     index, unit = next(((i, unit) for i, unit in weighed if unit in ("kg", "g", "lb")), (0, None))
     if unit and "normal_force" in kind.optional and "normal_force" not in guessed.columns:
-        source = f'columns.normal_force = {{ from = {source_of(found, index)}, unit = "{unit}f" }}'
-        yield f"#: If {found.names[index]!r} is the mass that presses on the track, add: {source}"
+        line = f'columns.normal_force = {{ from = {source_of(found, index)}, unit = "{UNKNOWN}" }}'
+        yield _commented(line, "unsure", f'write "{unit}f" if this mass presses on the track, else remove the line')
 
 
 def _commented(line: str, confidence: str, reason: str) -> str:

@@ -113,7 +113,7 @@ MASSES_OF_FREE = {"viscous": ("m1", "m2")}
 
 
 def _of_laws(facts: Facts) -> str:
-    """What the mean over the laws says, the readings that are missing, and the words that state a law."""
+    """What all laws together say, the readings that are missing, and the words that state a law."""
     name, other = facts["name"], facts["other"]
     more = "slides at higher speeds" if facts["slow"] else "slides at other speeds"
     wider = (
@@ -121,8 +121,8 @@ def _of_laws(facts: Facts) -> str:
         f"rig.toml: {facts['other_line']}. "
     )
     return (
-        f"{facts['labels']}: which friction law holds is not known from these readings. The mean over the laws, by their "
-        f"probabilities, is {facts['means']}; {name} alone gives {facts['now']}. To decide, add "
+        f"{facts['labels']}: which friction law holds is not known from these readings. All laws together, by their "
+        f"probabilities, give {facts['means']}; {name} alone gives {facts['now']}. To decide, add "
         f"{more if facts['tilts'] else 'tilts (static_friction)'}. {wider * (other is not None)}"
         f"Where you know that {name} holds, write in [rig]: confirmed = [{facts['confirmed']}]"
     )

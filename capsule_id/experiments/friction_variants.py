@@ -28,10 +28,10 @@ from capsule_id.views import Finding, Level, after_number
 
 #: Ratio of marginal likelihoods above which a variant is rejected, and above which data tell it from the best.
 FACTOR, TELLING = 100.0, 10.0
-#: Shift of a value, in its sd, by the mean over all laws with their probabilities as weights, from which it is in doubt.
+#: Rms error of a value over all laws, with their probabilities as weights, in its sd, from which it is in doubt.
 #: Of 160 clean rigs with 8 tilts and 8 slides 4 are, of 80 with a ratio of 0.8 all. Without tilts, or where all slides are
 #: slower than v_s, a quarter of the clean ones: their readings do not tell.
-DOUBTFUL = 1.5
+DOUBTFUL = 3.5
 #: Largest speed relative to v_s from which slides show where the friction ends to fall.
 FAST = 1.5
 #: Number of groups of readings, neighbours in speed: time and memory do not grow with the readings beyond.
@@ -233,16 +233,20 @@ FEWEST_SLIDES, SEED = 3, 0
 def _doubt(
     variants: Sequence[Variant], used: Variant, fastest: float, choices: ModelChoices
 ) -> tuple[list[Parameter], dict[str, Any]]:
-    """Parameters that the mean over the laws moves by ``DOUBTFUL`` sd (Hoeting et al. 1999), and the facts of its words.
+    """Parameters that all laws together know ``DOUBTFUL`` times worse (Hoeting et al. 1999), and the facts of its words.
 
-    The mean is over the laws that have the parameter, by their probabilities. ``fastest``: largest speed of a slide, m/s.
+    Means, and mean squares about the value of the law in use, are over the laws that have the parameter, by their
+    probabilities. ``fastest``: largest speed of a slide, m/s.
     """
-    means = {}
+    means, spreads = {}, {}
     for name in used.values.keys() | {"v_s"}:
         own = [variant for variant in variants if name in variant.values]
         weights = special.softmax([variant.evidence for variant in own])
-        means[name] = float(np.dot(weights, [variant.values[name] for variant in own]))
-    shifts = {name: abs(means[name] - value) / used.sds[name] for name, value in used.values.items()}
+        values, sds = np.array([(variant.values[name], variant.sds[name]) for variant in own]).T
+        means[name] = float(np.dot(weights, values))
+        about = values - used.values.get(name, means[name])
+        spreads[name] = float(np.sqrt(np.dot(weights, about**2 + sds**2)))
+    shifts = {name: spreads[name] / used.sds[name] for name in used.values}
     moved = [row for row in used.model.parameters if shifts[row.symbol] > DOUBTFUL]
     # A law that contains the one in use takes nothing away from it.
     wider = [variant for variant in variants if used.values.keys() < variant.values.keys()]
@@ -253,7 +257,9 @@ def _doubt(
         "other_factor": float(np.exp(np.clip(other.evidence - used.evidence, -700.0, 700.0))),
         "slow": fastest < FAST * means["v_s"],
         "shift": max(shifts.values()),
-        "means": ", ".join(f"{row.name} = {means[row.symbol]:.3g}{after_number(row.unit)}" for row in moved),
+        "means": ", ".join(
+            f"{row.name} = {means[row.symbol]:.3g} ± {spreads[row.symbol]:.2g}{after_number(row.unit)}" for row in moved
+        ),
         "now": ", ".join(
             f"{row.name} = {used.values[row.symbol]:.3g} ± {used.sds[row.symbol]:.2g}{after_number(row.unit)}"
             for row in moved
@@ -281,7 +287,7 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
     """Compare the friction law in use with other laws, and recommend the simplest that the readings allow.
 
     The law in use fails where another one has a marginal likelihood ``FACTOR`` times larger, or where its residuals are
-    ordered by speed. Else a parameter that the mean over all laws shifts by ``DOUBTFUL`` sd is not judged, unless the law
+    ordered by speed. Else a parameter that all laws together know ``DOUBTFUL`` times worse is not judged, unless the law
     is confirmed.
     """
     # Laws that depend on the speed can be compared where each reading has one.

@@ -498,6 +498,8 @@ CHANCE, OUTSIDE, MOST_BELOW, FEWEST_ABOVE = 2e-5, 1e-2, 4, 3
 HALF_DIGIT = 0.51
 #: Numbers that programs write for no reading.
 _NO_READING = re.compile(r"-?(?:9{3,}(?:\.(?:9+|25))?|9{2,}\.9+)|32767|-32768|65535|2147483647|-2147483648")
+#: The number of a trial, and the label of a row.
+_NUMBER, _NAME = re.compile(r"[0-9]+\.?"), re.compile(r"[^\W\d_]{2}")
 #: Distance of such a number from all others, in ranges of those: of one alone, and of one that is repeated.
 FAR_ALONE, FAR = 10.0, 1.0
 
@@ -561,10 +563,16 @@ def no_readings(export: Export, layout: Layout, columns: Sequence[np.ndarray]) -
     count = len(export.lines)
     if export.cells is not None and count <= MOST_TRIALS and count * export.width <= MOST_CELLS:
         kept = {k for k in range(export.width) if is_wanted(k, export.headers, layout.words)}
-        cells = ((row, cell) for row, each in enumerate(export.cells()) for k, cell in enumerate(each) if k not in kept)
+        lines = [list(each) for each in export.cells()]
+        cells = ((row, cell) for row, each in enumerate(lines) for k, cell in enumerate(each) if k not in kept)
         labels = {row: cell for row, cell in cells if is_statistic(cell)}
         if not any(STATISTICS & {*_bare(label).split("_")} for label in labels.values()):
             labels = {row: label for row, label in labels.items() if labels.keys() >= {*range(row, count)}}
+        for column in ([each[k] for each in lines if k < len(each)] for k in range(export.width) if k not in kept):
+            # Words below the numbers of the trials: what they name is no trial, whatever the word.
+            numbered = next((row for row, cell in enumerate(column) if not _NUMBER.fullmatch(cell)), count)
+            if FEWEST_ABOVE <= numbered < len(column) == count and all(map(_NAME.match, column[numbered:])):
+                labels |= dict(enumerate(column[numbered:], numbered))
         if len(labels) in (0, count):
             below = statistics_below(columns) if columns and layout.data_to_line is None else 0
             labels = dict.fromkeys(range(count - below, count), "")

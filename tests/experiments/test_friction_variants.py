@@ -2,6 +2,7 @@
 
 import dataclasses
 import tracemalloc
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -191,10 +192,12 @@ def bench_twin(
     model: ModelChoices = EQUATION_1,
     confirmed: tuple[str, ...] = (),
     contact: type[Force] | None = None,
+    speeds: Sequence[float] = (),
 ) -> Finding:
     """What the comparison finds on 8 tilts and 8 slides with a ``ratio`` of kinetic to static friction."""
     rng = np.random.default_rng(seed)
     mu, v_s, speed = rng.uniform(0.15, 0.7), 0.3 * 10.0 ** rng.uniform(-0.5, 0.4), rng.uniform(0.15, 1.0, 8)
+    speed = np.array(speeds) if speeds else speed
     law = CoulombStribeck(mu, 1.0, v_s, ratio=ratio)
     coefficient = law.forward(speed) * np.exp(0.02 * rng.standard_normal(8))
     angle = np.arctan(mu * np.exp(0.01 * rng.standard_normal(8)))
@@ -221,6 +224,13 @@ def test_a_law_that_few_readings_choose_is_in_doubt() -> None:
     # A contact is no other friction law: before, the law in use stood beside itself.
     beside = bench_twin(DOUBTED, 0.8, contact=Hertz)
     assert (beside.level, beside.facts["shift"]) == ("warn", found.facts["shift"])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slides_of_one_speed_beside_tilts_leave_v_s_unjudged(seed: int) -> None:
+    """Every law gives about the same v_s, with other sds. Before: the means alone counted, and v_s was trusted."""
+    found = bench_twin(seed, 0.8, speeds=[0.3] * 8)
+    assert (found.level, found.parameters) == ("warn", ("v_s",))
 
 
 @pytest.mark.slow

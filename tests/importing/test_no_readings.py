@@ -25,6 +25,8 @@ TILT = '[[experiment]]\nkind = "static_friction"\nfile = "t.csv"\n'
 BY_NUMBER = 'columns = { angle = { from = 2, unit = "deg" } }'
 LABELS = ["Mean", "SD", "Sum", "Average", "Mittelwert", "Stdev", "Summe", "Moyenne", "Standardabweichung", "Écart-type"]
 LABELS += ["Promedio", "Media", "Avg:", "Std. Dev.", '"Mean value"', "standard deviation", "MAX"]
+# Words below the numbers of the trials, whatever they are. Before: "Literature" was read as a trial.
+LABELS += ["St. dev.", "Uncertainty", "Literature"]
 
 
 def read(folder: Path, table: str, entry: str = TILT + BY_NUMBER) -> Rig:
@@ -56,6 +58,12 @@ def test_labelled_statistics_are_refused_and_the_remedy_works(tmp_path: Path, la
     assert caught.value.line == 7 + len(gap)
     assert "state data_to_line = 6" in caught.value.remedy
     np.testing.assert_allclose(angles_of(read(tmp_path, table, f"{TILT}data_to_line = 6\n{BY_NUMBER}")), ANGLES)
+
+
+def test_an_unknown_word_below_a_known_one_is_left_out_too(tmp_path: Path) -> None:
+    """Before: no data_to_line, and a remedy that left the sd among the readings: mu was 11 % too small."""
+    (tmp_path / "t.csv").write_text("\n".join(["Trial,Angle (deg)", *TRIALS, "Mean,31.9", "St. dev.,0.8", ""]))
+    np.testing.assert_allclose(angles_of(entered(tmp_path / "a", tmp_path / "t.csv")), ANGLES)
 
 
 def test_statistics_between_groups_are_refused(tmp_path: Path) -> None:

@@ -180,4 +180,4 @@ def test_columns_that_are_not_used_are_named(tmp_path: Path) -> None:
     assert "normal_force" not in entry
     pull = "Pull force (N),Load (kg)\n3.1,0.5\n6.2,1.0\n9.0,1.5\n12.4,2.0\n"
     entry = entry_of(tmp_path, "pull.csv", pull.encode())
-    assert 'add: columns.normal_force = { from = "Load (kg)", unit = "kgf" }' in entry
+    assert 'columns.normal_force = { from = "Load (kg)", unit = "?" }  # unsure: write "kgf" if' in entry
