@@ -190,6 +190,8 @@ def drive_power(force: Phasor, position: Phasor, Omega: float) -> tuple[float, f
 FEWEST_CLIPPED, EXCESS = 3, 5.0
 #: Number of neighbouring values. The peak of a sine that is read in steps has 3.4 times their mean number.
 NEIGHBOURS = 5
+#: A clipped run is so many times longer than the runs of equal readings usually are.
+LONGER = 1.5
 #: Readings of at least this part of a limit have its step, where there are so many.
 LARGE_JUMP, FEWEST_LARGE = 0.3, 20
 #: A record that begins or ends at its limit for longer than this fraction of a period is not clipped there.
@@ -214,6 +216,7 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
     period : of the oscillation, samples; infinite where it is unknown
     """
     found = list[Clipped]()
+    held = float(np.median(np.diff([0, *(np.flatnonzero(np.diff(values)) + 1), len(values)])))
     few, limits = thinned(values), (float(np.max(values)), float(np.min(values)))
     sides: tuple[tuple[Literal["upper", "lower"], float], ...] = (("upper", 1.0), ("lower", -1.0))
     for (side, sign), limit in zip(sides, limits, strict=True) if limits[0] > limits[1] else ():
@@ -229,8 +232,9 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
         runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
         # A hold before the release, or the rest of an overdamped decay.
         runs = [run for run in runs if len(run) <= LONGEST_HOLD * period or 0 < run[0] <= run[-1] < len(values) - 1]
-        # Noise makes single samples equal to the limit by rounding; a clipped peak gives neighbours.
-        runs = [run for run in runs if len(run) > 1]
+        # Noise makes single samples equal to the limit by rounding; a clipped peak gives neighbours, more than a sensor
+        # does that is read several times before it has a new value.
+        runs = [run for run in runs if len(run) > LONGER * held]
         if sum(map(len, runs)) >= FEWEST_CLIPPED:
             found.append(Clipped(side, limit, np.concatenate(runs)))
     return found

@@ -42,7 +42,7 @@ from capsule_id.views import counted
 #: Words for a column of a kind, without accents, by its name; a column is always known by its own name too. Words for
 #: the uncertainty of any, and parts of the names of frictions.
 WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in {
-    "time": "time t zeit messzeit temps tiempo tempo elapsed timestamp clock value duree instant istante "
+    "time": "time t zeit messzeit temps tiempo tempo elapsed timestamp clock millis micros value duree instant istante "
     "instante zeitstempel datetime datumzeit uhrzeit heure hora ora",
     "x_rel": "relative displacement disp deflection position pos x s weg laser distance abstand auslenkung "
     "ausschlag verschiebung elongation desplazamiento deplacement spostamento posicion posizione "

@@ -85,6 +85,14 @@ def test_a_record_that_begins_on_its_coarsely_read_top_is_not_clipped() -> None:
     assert len(clipped_samples(np.clip(begun, -2.0, 1.9), 5.0 * SAMPLES)) == 1
 
 
+def test_a_sensor_that_is_read_several_times_before_it_has_a_new_value_is_not_clipped() -> None:
+    """Before: "clipped at its upper limit", and lines of a later start without end."""
+    k = np.arange(400)
+    swing = np.round(np.exp(-0.004 * k) * np.cos(0.11 * k) + 0.01 * np.random.default_rng(3).standard_normal(400), 3)
+    assert clipped_samples(np.repeat(swing, 3), 170.0) == []
+    assert len(clipped_samples(np.repeat(np.clip(swing, -2.0, 0.7), 3), 170.0)) == 1
+
+
 @pytest.mark.parametrize(("step", "limit"), [(0.005, 0.9), (0.01, 0.8), (0.02, 0.7)])
 @pytest.mark.parametrize("begin", [0, 40])
 def test_a_record_that_begins_saturated_is_clipped(step: float, limit: float, begin: int) -> None:
