@@ -216,7 +216,8 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
     period : of the oscillation, samples; infinite where it is unknown
     """
     found = list[Clipped]()
-    held = float(np.median(np.diff([0, *(np.flatnonzero(np.diff(values)) + 1), len(values)])))
+    # Lengths of the runs of equal readings; NaN ends the first and the last one.
+    held = float(np.median(np.diff(np.flatnonzero(np.diff(values, prepend=np.nan, append=np.nan)))))
     few, limits = thinned(values), (float(np.max(values)), float(np.min(values)))
     sides: tuple[tuple[Literal["upper", "lower"], float], ...] = (("upper", 1.0), ("lower", -1.0))
     for (side, sign), limit in zip(sides, limits, strict=True) if limits[0] > limits[1] else ():
