@@ -485,10 +485,12 @@ def read_rig(
 
 def _check_numbers(seed: int, budget: int | None, ess: float) -> None:
     """Refuse numbers of a fit that are out of range."""
-    if not isinstance(seed, int) or seed < 0:
+    if not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")
-    if budget is not None and budget < 1:
-        raise InputError("budget must be positive", str(budget), "give 1 or more steps, or None: the point fit alone")
+    if budget is not None and (not isinstance(budget, int | np.integer) or budget < 1):
+        raise InputError(
+            "budget must be a positive whole number", str(budget), "give 1 or more steps, or None: the point fit alone"
+        )
     if not 0 < ess < float("inf"):
         raise InputError("ess must be positive and finite", str(ess), f"give {DEFAULT_ESS:.0f}, the default")
 

@@ -345,6 +345,6 @@ def _compare(args: Namespace, rigs: Sequence[Rig], kinds: Registry) -> int:
         raise InputError("--compare prints tables, writes nothing and fits all experiments", names, f"remove {names}")
     compare = cid.compare_points if args.no_sample else cid.compare_models
     with Progress(not args.quiet, "step") as progress:
-        choice = compare(rigs[0], args.compare.split(","), kinds, args.seed, progress)
+        choice = compare(rigs[0], [word.strip() for word in args.compare.split(",")], kinds, args.seed, progress)
     say(choice.text)
     return 0

@@ -330,7 +330,10 @@ def check_variants(experiments: Sequence[Any], fit: Fitted) -> list[Finding]:
         }
         for variant in variants
     ]
-    rejected, ordered = facts["factor"] > FACTOR, used.lack_of_fit < LEVEL
+    # A law that the one in use contains is more probable for having fewer parameters: the numbers hold.
+    best = max(variants, key=lambda variant: variant.evidence).values.keys()
+    contained = {"v_s"} <= best < used.values.keys()
+    rejected, ordered = facts["factor"] > FACTOR and not contained, used.lack_of_fit < LEVEL
     level: Level = "fail" if rejected else "warn" if moved and "friction" not in rig.confirmed else "ok"
     concerned = tuple(row.name for row in moved) if level == "warn" else names
     return [

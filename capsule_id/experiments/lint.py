@@ -308,11 +308,23 @@ def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
     return rig.files.get(table.file, table.label), *readings
 
 
+def _read_part(table: Table[Any]) -> Table[Any]:
+    """The table from ``start`` to ``stop`` of its settings: several tests may stand in one record."""
+    start, stop = (getattr(table.settings, name, None) for name in ("start", "stop"))
+    if "time" not in table.columns or start is stop is None:
+        return table
+    time = table["time"]
+    used = (time >= (time[0] if start is None else start)) & (time <= (time[-1] if stop is None else stop))
+    columns = {name: replace(column, values=column.values[used]) for name, column in table.columns.items()}
+    return replace(table, columns=columns, rows=table.rows[used]) if used.any() else table
+
+
 def _repeated(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
     """Report tables with the same readings of files with the same bytes, then other rows that occur twice.
 
     These may stand within a table or in tables with the same columns.
     """
+    whole, tables = {table.label: table for table in tables}, [_read_part(table) for table in tables]
     by_content: dict[tuple[object, ...], list[Table[Any]]] = {}
     groups: dict[tuple[str, ...], list[Table[Any]]] = {}
     for table in tables:
@@ -342,7 +354,9 @@ def _repeated(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
                 "first": first.file,
                 "first_line": int(first.rows[block.first_row]),
                 "first_last": int(first.rows[block.first_row + block.count - 1]),
-                "rows": list(range(block.row, block.row + block.count)),
+                "rows": np.flatnonzero(
+                    np.isin(whole[later.label].rows, later.rows[block.row : block.row + block.count])
+                ).tolist(),
             }
             yield Finding("readings.repeated", "fail", facts, block.label)
 

@@ -397,7 +397,10 @@ def next_tests(
 
 def _plan(result: Result, targets: Sequence[str], options: Sequence[Option], left_out: list[str]) -> Plan:
     """The options in order, without those that change nothing."""
-    useful = [option for option in options if _worth(option) < -LEAST] or options
+    useful = [option for option in options if _worth(option) < -LEAST]
+    if not useful:
+        rule = "a further test must change the sd of a target by 1 % or more"
+        raise InputError(rule, f"none of {len(options)} does", "give more minutes, or other targets")
     if len(useful) < len(options):
         left_out.append(f"{counted(len(options) - len(useful), 'choice')} that change these sds by less than 1 %")
     options = sorted(useful, key=_worth)

@@ -97,6 +97,11 @@ class Column:
         return float(np.hypot(self.sd or 0.0, (self.resolution or 0.0) * STEP_SD))
 
     @property
+    def rounding_sd(self) -> float:
+        """Rounding error of a reading, SI: of the stated step, or of the last digit."""
+        return (self.resolution or self.unstated_step) * STEP_SD
+
+    @property
     def unstated_step(self) -> float:
         """Step of the last decimal digit of the values in their unit, at most 1 of it; SI.
 

@@ -111,6 +111,15 @@ def _posterior(path: Path, draws: int = 6) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.full
+def test_a_diagram_whose_runs_all_fail_says_so_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    """Before: a RuntimeWarning of NumPy beside it."""
+    words = ["--over", "m1", "--from", "0.1", "--to", "1", "--points", "3", "--k2", "18960", "--dropped", "5"]
+    assert _run(*words, "--observed", "3", "--c", "1e300", "--out", "f.nc") == 0
+    said = capsys.readouterr()
+    assert "3 runs failed" in said.out
+    assert said.err == ""
+
+
 def test_posterior_bands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drawn = _posterior(tmp_path / "posterior.nc")
     axis = ["--over", "P_d", "--from", "3", "--to", "4.5", "--points", "3", "--posterior", "posterior.nc"]

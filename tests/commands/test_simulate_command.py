@@ -75,6 +75,8 @@ def test_parameters_of_a_result(tmp_path: Path, capsys: pytest.CaptureFixture[st
     for words in ([*drive, "--G", "inf"], [word for word in drive if word not in ("--result", str(tmp_path))]):
         with pytest.raises(InputError, match="--spring needs the result that it is of, and a gap"):
             command.capsule_values(parser.parse_args([*words, "--k2", "2e4", "--spring", "L60"]))
+    with pytest.raises(InputError, match="--spring chooses k2, --k2 is given, too"):
+        command.capsule_values(parser.parse_args([*drive, "--k2", "2e4", "--spring", "L60"]))
     # What the folder states is held. Before: level ground, and a drive that reacts on the ground.
     held = {"reaction": 1.0, "slope": 0.05, "lag": 0.006, "P_off": None}
     (tmp_path / "parameters.json").write_text(json.dumps({"parameters": rows, "fixed": held}), encoding="utf-8")

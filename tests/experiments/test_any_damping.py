@@ -456,3 +456,28 @@ def test_a_light_decay_is_known_by_a_hundred_samples(monkeypatch: pytest.MonkeyP
     x = viscous(time, 120.0**2, 7.2, 1.0) + 0.004 * np.random.default_rng(0).standard_normal(400)
     assert decay_frequency(time, x) == pytest.approx(19.1, rel=0.05)
     assert 0 < sum(sizes) < 80_000
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.full)])
+def test_a_clean_decay_in_coarse_digits_passes(tmp_path: Path, seed: int) -> None:
+    """Digits of three times the noise. Before: the first half period was "louder", and each later start as well."""
+    time, rng = np.arange(2000) * 5e-4, np.random.default_rng(seed)
+    x = -1.92e-3 * viscous(time, 1420.0, 3.9, 0.11) + 3e-6 * rng.standard_normal(2000)
+    result = cid.fit(folder(tmp_path, time, np.round(x, 5), 0.11), budget=None)
+    assert list(result.failed) == []
+    rows = result.summary.loc[["k1", "c"]]
+    assert np.all(np.abs(rows["value"] - [1420.0, 3.9]) < 4.0 * rows["sd"])
+
+
+@pytest.mark.parametrize(("start", "found"), [(2.0, set()), (0.8, {"readings.repeated"})])
+def test_one_record_may_hold_two_entries(tmp_path: Path, start: float, found: set[str]) -> None:
+    """As the guide says. Before: "the same content, remove one of the two"; the control: parts that share readings."""
+    time = np.arange(3000) * 1e-3
+    x = np.concatenate([viscous(time[:1500], 1420.0, 1.0, 0.11)] * 2)
+    x += 1e-3 * np.random.default_rng(0).standard_normal(3000)
+    first = 'start = { value = 0, unit = "s" }\nstop = { value = 1.4, unit = "s" }\n'
+    second = '[[experiment]]\nkind = "free_vibration"\nfile = "d.csv"\nlabel = "second"\n'
+    second += f'start = {{ value = {start}, unit = "s" }}'
+    rig = cid.read_rig(folder(tmp_path, time, 1e-3 * x, 0.11, first + second))
+    codes = {finding.code for finding in lint(rig, default_registry(), rig.tables)}
+    assert {code for code in codes if code.startswith("readings.repeated")} == found

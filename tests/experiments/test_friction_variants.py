@@ -233,6 +233,14 @@ def test_slides_of_one_speed_beside_tilts_leave_v_s_unjudged(seed: int) -> None:
     assert (found.level, found.parameters) == ("warn", ("v_s",))
 
 
+@pytest.mark.parametrize("seed", [3, 6])
+def test_a_law_within_the_one_in_use_does_not_refute_it(seed: int) -> None:
+    """Eq. (1) is 100 times as probable for its fewer parameters alone. Before: all friction numbers were not trusted."""
+    speeds = np.linspace(0.15, 1.0, 20)[:8].tolist()
+    found = bench_twin(seed, 0.5, ModelChoices(free=("ratio", "viscous")), speeds=speeds)
+    assert (found.level, found.facts["factor"] > 100.0) == ("ok", True)
+
+
 @pytest.mark.slow
 def test_how_often_a_law_is_in_doubt() -> None:
     """Of 80 clean twins one was, of 80 with a ratio of 0.8 all, of 80 with 0.65 77."""

@@ -38,6 +38,22 @@ def slopes(replicates: int, along: bool) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.parametrize("moved", [0.0, 0.1])
+def test_rounding_of_exact_readings_is_no_bend_and_no_outlier(moved: float) -> None:
+    """Before: a bend of 0.0 % of the range, and a reading 2e8 sds off the others; both failed."""
+    current = 0.2 * np.arange(1, 11)
+    force = np.round(K * current + moved * (np.arange(10) == 3), 1)
+
+    def found(force: np.ndarray) -> set[str]:
+        rig = bench.rig(bench.table("motor_current", [bench.column("force", force), bench.column("current", current)]))
+        return {finding.code for finding in cid.fit(rig, budget=None).findings if finding.level != "ok"}
+
+    judged = {"lines.straight", "lines.origin", "outliers"}
+    assert not judged & found(force)
+    # The control: a bend of five digits at mid range.
+    assert "lines.straight" in found(np.round(force + 2.0 * (current / 2.0) ** 2, 1))
+
+
 def test_slope_is_unbiased_under_errors_in_both_columns() -> None:
     found = slopes(300, along=True)
     error = np.std(found, ddof=1) / np.sqrt(found.size)

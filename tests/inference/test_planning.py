@@ -209,6 +209,12 @@ def test_records_count_as_often_as_they_fit_into_the_time(rig: Rig) -> None:
     assert 2.8 < gains[0] / smaller < 4.0
 
 
+def test_tests_that_change_nothing_are_not_proposed(rig: Rig) -> None:
+    """Before: pushes for K, "x 1.00", in all rows."""
+    with pytest.raises(InputError, match="must change the sd of a target by 1 % or more, none of "):
+        next_tests(result_of(rig), ["K"], minutes=0.6)
+
+
 def test_kinds_share_the_time_where_both_help(rig: Rig) -> None:
     plan = next_tests(result_of(rig), ["c", "v_s"], minutes=30)
     assert " + " in plan.table.iloc[0]["kind"]

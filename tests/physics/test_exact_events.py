@@ -103,6 +103,13 @@ def test_zero_gap_without_a_rate_until_the_drive_sets_in(drive: Any, back: bool)
     assert energy_balance(replace(RIG, **other), drive, (0.0, 0.6)).relative_residual < 1e-8
 
 
+def test_a_capsule_without_friction_turns_where_the_drive_sets_in() -> None:
+    """Before: the turn was passed, and 5 % of the energy was missing."""
+    p = replace(RIG, mu=0.0, viscous=5.0, G=np.inf, k2=0.0)
+    balance = energy_balance(p, Pulses(4.0, 0.2, 0.5, 0.0, phase=np.pi), (0.0, 0.6))
+    assert balance.relative_residual < 1e-8
+
+
 def test_stick_slip_chatter_is_resolved() -> None:
     """A steep Stribeck curve and a drive just above the threshold: short slips, each with an onset and a stop."""
     p = CapsuleParameters(m1=0.1, m2=0.02, k1=1e5, k2=0.0, c=5.0, mu=0.5, v_s=1e-3, G=1.0)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import capsule_id
+from capsule_id.api import _check_numbers
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import default_registry
 from capsule_id.rig import guess
@@ -131,6 +132,12 @@ def test_a_seed_is_a_whole_number(seed: object) -> None:
     rig = capsule_id.read_rig(Path(__file__).parents[2] / "data")
     with pytest.raises(InputError, match="seed must be a whole number, not negative"):
         capsule_id.fit(rig, seed=seed)  # type: ignore[arg-type]
+
+
+def test_numbers_of_a_fit_may_be_those_of_numpy_and_are_whole() -> None:
+    _check_numbers(np.int64(3), np.int64(100), 1000.0)  # type: ignore[arg-type]  # pyright: ignore
+    with pytest.raises(InputError, match=r"budget must be a positive whole number, 100\.5"):
+        _check_numbers(0, 100.5, 1000.0)  # type: ignore[arg-type]  # pyright: ignore
 
 
 def test_the_length_of_one_board_is_stated_as_the_template_says(tmp_path: Path) -> None:

@@ -33,6 +33,8 @@ from capsule_id.views import Facts, Finding, Level, ResultTable, listed
 
 #: Rounding errors are no noise where all noise is below this share of the distance of levels; rounding alone is 0.29 of it.
 COARSE = 0.42
+#: Above this share rounding adds little to the noise: sizes of residuals then tell of the motion.
+FINE = 0.55
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
 INTERVALS, READINGS_PER_INTERVAL = 12, 5
 #: Largest part of a drift that is as fast as the motion, relative to the motion.
@@ -342,7 +344,9 @@ def onset(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | None:
     equal = stats.chi2.sf(change @ np.linalg.pinv(covariance) @ change, len(names))
     # Ranks: one wrong reading there is no release.
     louder: Any = stats.mannwhitneyu(np.abs(known[~later, 0]), np.abs(known[later, 0]), alternative="greater")
-    both = np.maximum([equal, louder.pvalue], np.finfo(float).tiny)
+    # Coarse digits are noise where the rod moves alone.
+    fine = coarse_levels(e)["share"] > FINE
+    both = np.maximum([equal, louder.pvalue] if fine else [equal], np.finfo(float).tiny)
     p = float(stats.chi2.sf(-2.0 * np.sum(np.log(both)), 2 * len(both)))  # Fisher's sum
     i = int(np.argmax(np.abs(change) / sd))
     whole, changed = theta[names[i]], theta[names[i]] + float(change[i] / unit[at[i]])

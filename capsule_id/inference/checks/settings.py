@@ -83,7 +83,9 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
 def _known_share(experiment: Experiment, theta: ValuesBySymbol) -> np.ndarray:
     """(n,) variance of the stated errors, or of the step of the digits, in units of the noise of each reading."""
     parts = [np.broadcast_to(one.fixed_variance, one.raw.shape) for one in experiment.misfits(theta, np)]
-    return np.concatenate(parts) / experiment.misfit(theta).sd ** 2
+    column = experiment.table.columns.get(getattr(experiment, "reading", ""))
+    rounding = 0.0 if column is None else column.rounding_sd**2
+    return np.maximum(np.concatenate(parts), rounding) / experiment.misfit(theta).sd ** 2
 
 
 def _studentised(r: np.ndarray, q: np.ndarray, known: np.ndarray | None) -> tuple[np.ndarray, int | None]:
