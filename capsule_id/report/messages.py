@@ -454,7 +454,7 @@ QUESTIONS: Mapping[str, str] = {
     "friction.one_surface": "Do tilts and slides show one surface? {p:p}, limit 0.002.",
     "friction.variants": (
         "Would another friction law matter? The best one is {factor:.3g} times as probable, limit 100; "
-        "over all laws a value is {shift:.2g} times as uncertain, limit 3.5."
+        "over all laws a value is {shift:.2g} times as uncertain, limit 3."
     ),
     "springs.cantilever": "Does k2 fall as L^-3? The exponent is {exponent:.3f} ± {sd:.3f} ({p:p}), limit p = 0.002.",
 }
