@@ -310,7 +310,8 @@ def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
 
 def _read_part(table: Table[Any]) -> Table[Any]:
     """The table from ``start`` to ``stop`` of its settings: several tests may stand in one record."""
-    start, stop = (getattr(table.settings, name, None) for name in ("start", "stop"))
+    ends = (getattr(table.settings, name, None) for name in ("start", "stop"))
+    start, stop = (end if isinstance(end, float) else None for end in ends)  # a run has words, too
     if "time" not in table.columns or start is stop is None:
         return table
     time = table["time"]

@@ -400,7 +400,7 @@ def _plan(result: Result, targets: Sequence[str], options: Sequence[Option], lef
     useful = [option for option in options if _worth(option) < -LEAST]
     if not useful:
         rule = "a further test must change the sd of a target by 1 % or more"
-        raise InputError(rule, f"none of {len(options)} does", "give more minutes, or other targets")
+        raise InputError(rule, f"{counted(len(options), 'choice')} below that", "give more minutes, or other targets")
     if len(useful) < len(options):
         left_out.append(f"{counted(len(options) - len(useful), 'choice')} that change these sds by less than 1 %")
     options = sorted(useful, key=_worth)
