@@ -211,7 +211,7 @@ def test_records_count_as_often_as_they_fit_into_the_time(rig: Rig) -> None:
 
 def test_tests_that_change_nothing_are_not_proposed(rig: Rig) -> None:
     """Before: pushes for K, "x 1.00", in all rows."""
-    with pytest.raises(InputError, match="must change the sd of a target by 1 % or more, [0-9]+ choices below that"):
+    with pytest.raises(InputError, match=r"must change the sd of a target by 1 % or more, [0-9]+ choices below that"):
         next_tests(result_of(rig), ["K"], minutes=0.6)
 
 
