@@ -69,10 +69,11 @@ def filled_in(text: str, facts: Facts) -> str:
 
 
 #: Checks of what one fault of a record leaves behind: where another check names a fault, they fail with it.
+#: Those that say most about the cause come first.
 SYMPTOMS = (
-    "residuals.white", "residuals.statistics", "decays.residuals", "decays.halves", "decays.onset", "decays.drift",
-    "decays.hidden", "decays.position", "decays.stiffness", "runs.repeated", "errors.stated", "outliers", "starts.agree",
-    "model.error",
+    "decays.stiffness", "decays.position", "decays.halves", "decays.onset", "decays.hidden", "decays.drift",
+    "decays.residuals", "runs.repeated", "errors.stated", "outliers", "residuals.white", "residuals.statistics",
+    "starts.agree", "model.error",
 )  # fmt: skip
 #: Warnings that name the cause of failed checks.
 CAUSES = ("decays.changing", "decays.tone")

@@ -40,7 +40,7 @@ from capsule_id.inference.tables import check_engine, make_notes, parameter_tabl
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import truth_beside
-from capsule_id.views import Comparison, Finding
+from capsule_id.views import SYMPTOMS, Comparison, Finding
 
 #: Number of posterior draws for bands and predictive p-values, and of prior draws in the saved sample.
 BAND_DRAWS, PRIOR_DRAWS = 200, 2000
@@ -146,7 +146,15 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
             names = tuple(name for name, *_ in factors) if lost else ()
             findings.append(Finding("model.error", "fail" if lost else "warn", {"factors": factors}, parameters=names))
     # Causes first, and of these what the readings show by themselves.
-    findings.sort(key=lambda found: (not found.cause, found.cause and found.level == "warn"))
+    # Of what fails without a named cause the most telling comes first.
+    told = {code: place for place, code in enumerate(SYMPTOMS)}
+    findings.sort(
+        key=lambda found: (
+            not found.cause,
+            found.cause and found.level == "warn",
+            told.get(found.code, len(told)) if found.level == "fail" else len(told),
+        )
+    )
     return replace(checked, widened=widened, findings=tuple(findings))
 
 

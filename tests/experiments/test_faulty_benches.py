@@ -9,6 +9,8 @@ import pytest
 from scipy import stats
 
 import capsule_id as cid
+from capsule_id.experiments.kind import default_registry
+from capsule_id.report.messages import messages_of
 from tests import laboratory
 from tests.laboratory import Bench, Random
 
@@ -142,6 +144,13 @@ def test_an_error_is_in_the_interval_where_it_is_stated(tmp_path: Path, name: st
     stated = outcome(tmp_path / "stated", name, 1, True, 1)
     assert stated.trusted == frozenset(stated.z)
     assert max(np.abs([*stated.z.values()])) < 3.0
+
+
+def test_a_record_of_another_rig_is_named_first(tmp_path: Path) -> None:
+    """Before: "residuals white", whose remedies look into one record."""
+    found = outcome(tmp_path / "a", "mixed_rigs", 1, False, 0)
+    assert found.failed[0] == messages_of(default_registry())["decays.stiffness"].title
+    assert not found.trusted
 
 
 def test_an_error_of_one_per_cent_changes_what_the_sentence_says(tmp_path: Path) -> None:
