@@ -465,6 +465,8 @@ def test_a_clean_decay_in_coarse_digits_passes(tmp_path: Path, seed: int) -> Non
     x = -1.92e-3 * viscous(time, 1420.0, 3.9, 0.11) + 3e-6 * rng.standard_normal(2000)
     result = cid.fit(folder(tmp_path, time, np.round(x, 5), 0.11), budget=None)
     assert list(result.failed) == []
+    # k1 follows the square of a clock, c the clock.
+    assert result.summary["largest_error"][["k1", "c"]].tolist() == ["2 %: clock", "1 %: clock"]
     rows = result.summary.loc[["k1", "c"]]
     assert np.all(np.abs(rows["value"] - [1420.0, 3.9]) < 4.0 * rows["sd"])
 

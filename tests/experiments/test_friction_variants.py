@@ -18,7 +18,15 @@ from capsule_id.experiments import friction_variants
 from capsule_id.experiments.base import LEVEL
 from capsule_id.experiments.friction import FrictionExperiment, paper_friction_fit
 from capsule_id.experiments.friction_model import FrictionModel, model_lines
-from capsule_id.experiments.friction_variants import PARTICLES, PERMUTATIONS, VariantPoints, check_variants, fit_variant
+from capsule_id.experiments.friction_variants import (
+    PARTICLES,
+    PERMUTATIONS,
+    Variant,
+    VariantPoints,
+    _doubt,
+    check_variants,
+    fit_variant,
+)
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.statistics import of_neighbours, permutation_p
 from capsule_id.physics.forces import CoulombStribeck, Force
@@ -231,6 +239,17 @@ def test_slides_of_one_speed_beside_tilts_leave_v_s_unjudged(seed: int) -> None:
     """Every law gives about the same v_s, with other sds. Before: the means alone counted, and v_s was trusted."""
     found = bench_twin(seed, 0.8, speeds=[0.3] * 8)
     assert (found.level, found.parameters) == ("warn", ("v_s",))
+
+
+def test_a_law_that_knows_a_value_worse_counts_too() -> None:
+    """Two laws, equally probable, with one value: an sd of 5 in one of them is sqrt(13) of that of the other."""
+    used, other = (
+        Variant(FrictionModel(free=free), {"mu": 0.5, "v_s": 0.1}, {"mu": 0.01, "v_s": sd}, 0.0, 0.0, 0.0, 1.0)
+        for free, sd in (((), 0.01), (("ratio",), 0.05))
+    )
+    moved, facts = _doubt([used, other], used, 1.0, ModelChoices())
+    assert [row.symbol for row in moved] == ["v_s"]
+    assert facts["shift"] == pytest.approx(np.sqrt(13.0))
 
 
 @pytest.mark.parametrize("seed", [3, 6])

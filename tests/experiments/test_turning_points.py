@@ -12,8 +12,9 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.experiment import later_start
+from capsule_id.experiments.free_vibration.experiment import halves, later_start
 from capsule_id.experiments.free_vibration.hidden_terms import check_held
+from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.turning_points import TurningPoints, fitted, screened
 from capsule_id.experiments.kind import default_registry, make_experiments
 from capsule_id.experiments.lint import lint
@@ -241,6 +242,13 @@ def test_amplitudes_from_another_place_than_the_rest_position_are_no_force(
     text = finding_text(forces, messages_of(default_registry()))
     found = "a rest position at 0.1" if name == "rest position" else "Amplitudes must be counted from the rest position"
     assert found in text
+
+
+@pytest.mark.parametrize(("matters", "doubted"), [(True, ("k1", "c")), (False, ())])
+def test_halves_that_differ_leave_what_matters_unjudged(matters: bool, doubted: tuple[str, ...]) -> None:
+    e: Any = SimpleNamespace(label="a", model=DecayModel(), model_name="", stated_words=(), local=lambda values: values)
+    (found,) = halves(lambda e, theta: {"c": (1.0, 2.0, 3.5, matters)})([e], cast(Any, SimpleNamespace(values={})))
+    assert (found.level, found.parameters) == ("warn", doubted)
 
 
 def test_a_zero_that_is_hardly_seen_leaves_c_unjudged(tmp_path: Path) -> None:
