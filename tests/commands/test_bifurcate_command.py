@@ -117,7 +117,8 @@ def test_a_diagram_whose_runs_all_fail_says_so_alone(capsys: pytest.CaptureFixtu
     assert _run(*words, "--observed", "3", "--c", "1e300", "--out", "f.nc") == 0
     said = capsys.readouterr()
     assert "3 runs failed" in said.out
-    assert said.err == ""
+    # A slow machine has the time to report its progress.
+    assert [line for line in said.err.splitlines() if not line.startswith("points: ")] == []
 
 
 def test_posterior_bands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
