@@ -18,6 +18,7 @@ from capsule_id.experiments.free_vibration.experiment import (
     check_positions,
     fast_rms,
     graded,
+    size_of_residuals,
 )
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import decay
@@ -267,6 +268,19 @@ def test_noise_that_follows_the_amplitude_is_no_noise() -> None:
     assert (found.level, found.experiment) == ("fail", "decay")
     assert found.facts["ratio"] > 1.3
     assert f"add start = {{ value = {found.facts['start']:.10g}" in text(found)
+
+
+def test_the_noise_of_a_rod_at_rest_has_no_amplitude() -> None:
+    """Before: the amplitude was that of the readings, so it followed the noise that a coarse record at rest consists of."""
+    period = 2.0 * np.pi * float(np.sqrt(bench.M1 / bench.K1))
+    time = np.arange(3000) * (period / 10.0)
+    noise, values = np.random.default_rng(1).standard_normal(len(time)), {**VISCOUS, "c": 6.0, "noise_sd": 1e-5}
+    for size, limits in ((1e-5, (0.01, 1.0)), (1e-4 * np.exp(-time / period) + 1e-6, (0.0, 0.001))):
+        x = bench.released(time, RELEASE, c=6.0) + size * noise
+        table = bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)], "decay")
+        judged = size_of_residuals(FreeVibration(table, bench.rig(table)), values)
+        assert judged is not None
+        assert limits[0] <= judged[1] <= limits[1]
 
 
 def pendulum(release: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from capsule_id.records.release import FreeDecay, find_free_decay
 from tests.capsule_cases import jit_quickly
 from tests.experiments.bench import K1, M1, released
 from tests.records.test_fault_detectors import PERIOD, RATE, TIME, decay, encoder
-from tests.release_records import FORMS, draw
+from tests.release_records import FORMS, draw, free
 
 
 @pytest.mark.full
@@ -50,6 +50,19 @@ def test_a_release_after_a_hold_is_found(before: float, hold: float) -> None:
     # Negative control: a slowly damped decay without a hold begins with the record.
     slow = released(TIME, 2.0, c=0.1)
     assert cast(FreeDecay, find_free_decay(TIME, slow, displacement=True)).start == 0.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_long_rest_behind_the_decay_does_not_delay_the_release(seed: int) -> None:
+    """200 periods of rest. (Before: their noise was taken for slow swings below fast ones; the cut was periods late.)"""
+    rng, period, hold = np.random.default_rng([9, seed]), 0.032, 1.266
+    time = np.arange(0.0, hold + 200.0 * period, 1e-3)
+    motion = free(np.maximum(time - hold, 0.0) / period, 5e-3, 0.0, 0.034)
+    values = motion + 10.0 ** rng.uniform(-4.8, -4.2) * rng.standard_normal(len(time))
+    found = cast(FreeDecay, find_free_decay(time, values, displacement=True))
+    assert found.start == pytest.approx(hold, abs=0.1 * period)
+    cut = time >= found.start
+    assert cast(FreeDecay, find_free_decay(time[cut], values[cut], displacement=True)).rest == 0.0
 
 
 @pytest.mark.full

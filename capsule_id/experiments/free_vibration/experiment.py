@@ -240,9 +240,12 @@ def drift(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
 def size_of_residuals(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | None:
     """Judge whether the residuals are larger where the motion is larger: fitted noise then holds an error of the model.
 
-    Spearman's rank correlation of their sizes with the amplitude, before the motion is lost in the steps of the readings.
+    Spearman's rank correlation of their sizes with the amplitude of the fitted motion, before that is lost in the steps of
+    the readings. (Readings at rest are residuals themselves.)
     """
-    size = np.abs(e.values - equilibrium(e.values))
+    left = sensitivities(e, theta)[0]
+    curve = _without_last_digits(e.values, left)
+    size = np.abs(curve - equilibrium(curve))
     moving = np.flatnonzero(size >= STEPS * reading_step(e.whole[1]))
     n = int(moving[-1]) + 1 if len(moving) else 0
     if n < FEWEST_SIZES:
@@ -252,12 +255,19 @@ def size_of_residuals(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, flo
     amplitude = ndimage.maximum_filter1d(size[:n], max(3, round(period)))
     if np.ptp(amplitude) == 0.0 or np.ptp(residuals) == 0.0:
         return None
-    large = amplitude > np.median(amplitude)
+    # Those of the larger half of the motion, which a long rest may follow.
+    seen = amplitude[amplitude > np.std(left)]
+    large = amplitude > np.median(seen if len(seen) else amplitude)
     large = large if large.any() else amplitude == np.max(amplitude)
     ratio = float(np.sqrt(np.mean(residuals[large] ** 2) / np.mean(residuals[~large] ** 2)))
     trend = stats.spearmanr(amplitude, residuals, alternative="greater")
     p = float(trend.pvalue)  # pyright: ignore[reportAttributeAccessIssue]  (SciPy types the result as a tuple)
     return {"ratio": ratio, "p": p, **later_start(e)}, p if ratio > LARGER else 1.0
+
+
+def _without_last_digits(values: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """The fitted motion (n,): ``values`` minus residuals ``left``. At rest its last digits would depend on the residuals."""
+    return np.round((values - left) / np.ptp(values), 9) * np.ptp(values)
 
 
 def later_start(e: DecayRecord) -> Facts:
@@ -298,8 +308,7 @@ def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | Non
     if e.n < 2 * READINGS_PER_INTERVAL or (e.order == 2 and "dry" in e.model.damping):
         return None
     left, design, moved = sensitivities(e, theta)
-    # At rest the last digits of this difference depend on the residuals, and must not choose the interval.
-    curve = np.round((e.values - left) / np.ptp(e.values), 9) * np.ptp(e.values)
+    curve = _without_last_digits(e.values, left)
     offsets, limits = [], []
     number = min(INTERVALS, len(curve) // (2 * READINGS_PER_INTERVAL))
     for ahead in (np.gradient(curve, e.time) > 0.0, np.gradient(curve, e.time) <= 0.0):
