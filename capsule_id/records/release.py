@@ -210,10 +210,12 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
             own = 2.0 * float(np.mean(regular))
         decay = FreeDecay(start, stop, start - float(time[0]), own, pushed)
     slow = int(np.searchsorted(time, over, "right"))
-    # The noise of a long rest turns by more than is significant.
-    later = time[slow + _turning_points(values[slow:], BEYOND_CHANCE)] if len(time) - slow > WINDOW else time[:0]
-    if len(later) > 6 and not smooth and later[-1] - later[0] > 1.5 * period * (len(later) - 1):
-        width = int((later[-1] - later[0]) / (len(later) - 1) / 4.0 / np.median(np.diff(time)))
+    later = time[slow + _turning_points(values[slow:])] if len(time) - slow > WINDOW else time[:0]
+    legs = np.diff(later)
+    # The noise of a rod at rest turns too, but not regularly.
+    swings = len(legs) > 5 and np.quantile(np.abs(legs / np.median(legs) - 1.0), 0.9) < REGULAR
+    if swings and not smooth and np.sum(legs) > 1.5 * period * len(legs):
+        width = int(np.mean(legs) / 4.0 / np.median(np.diff(time)))
         padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
         values = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
         decay = _find(time_bytes, values.tobytes(), displacement, smooth=True)
@@ -240,13 +242,10 @@ def _push(time: np.ndarray, values: np.ndarray, start: float, period: float) -> 
     return max(start, float(time[top])), True
 
 
-def _turning_points(values: np.ndarray, beyond: float = SIGNIFICANT) -> np.ndarray:
-    """Indices of the turning points that differ by more than noise, and of the ends of the first and the last leg.
-
-    beyond : that part of the noise
-    """
+def _turning_points(values: np.ndarray) -> np.ndarray:
+    """Indices of the turning points that differ by more than noise, and of the ends of the first and the last leg."""
     levels = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
-    limit = max(TURN * float(np.ptp(levels)), beyond * noise_level(values))
+    limit = max(TURN * float(np.ptp(levels)), SIGNIFICANT * noise_level(values))
     turns, side, turn, other = list[int](), 0, 0, 0
     levels = levels.tolist()
     for i, level in enumerate(levels):
