@@ -210,11 +210,13 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
             own = 2.0 * float(np.mean(regular))
         decay = FreeDecay(start, stop, start - float(time[0]), own, pushed)
     slow = int(np.searchsorted(time, over, "right"))
-    later = time[slow + _turning_points(values[slow:])] if len(time) - slow > WINDOW else time[:0]
-    legs = np.diff(later)
-    # The noise of a rod at rest turns too, but not regularly.
-    swings = len(legs) > 5 and np.quantile(np.abs(legs / np.median(legs) - 1.0), 0.9) < REGULAR
-    if swings and not smooth and np.sum(legs) > 1.5 * period * len(legs):
+    later = slow + _turning_points(values[slow:]) if len(time) - slow > WINDOW else np.zeros(0, int)
+    if len(later) > 6 and not smooth and time[later[-1]] - time[later[0]] > 1.5 * period * (len(later) - 1):
+        legs, sizes = np.diff(time[later]), np.abs(np.diff(values[later]))
+        # The noise of a rod at rest turns too, but neither far nor regularly.
+        far = np.median(sizes) > 2.0 * BEYOND_CHANCE * noise_level(values[slow:])
+        if not far and np.quantile(np.abs(legs / np.median(legs) - 1.0), 0.9) > REGULAR:
+            return decay
         width = int(np.mean(legs) / 4.0 / np.median(np.diff(time)))
         padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
         values = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
