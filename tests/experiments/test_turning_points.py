@@ -372,6 +372,18 @@ def test_amplitudes_of_one_side_have_no_frequency_of_a_record() -> None:
     assert "decays.frequency" not in codes
 
 
+def test_how_amplitudes_of_one_side_are_read_is_said() -> None:
+    """|x_rel| of every swing looks like the maxima of a spring four times as stiff, and was trusted without a word."""
+    period = 2.0 * np.pi / float(np.sqrt(bench.K1 / bench.M1 - (bench.C / (2.0 * bench.M1)) ** 2))
+    for one_side in (False, True):
+        rig = bench.rig(bench.table("free_vibration", _viscous_turns(2e-3, one_side), samples="turning_points"))
+        said = [found for found in lint(rig, default_registry(), rig.tables) if found.code == "decays.one_side"]
+        assert [found.level for found in said] == ["ok"] * one_side
+        for found in said:
+            assert found.facts["period"] == pytest.approx(period, rel=1e-3)
+            assert "write the sign of each" in finding_text(found, messages_of(default_registry()))
+
+
 def test_a_stated_hum_is_no_release() -> None:
     """Before: the hum beside the first swing was taken for rest, or for a second excitation, stated or not."""
     rng, time = np.random.default_rng(0), np.arange(1000) / 2000.0

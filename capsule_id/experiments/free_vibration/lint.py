@@ -17,6 +17,7 @@ from capsule_id.experiments.free_vibration.readings import (
     cut_at_release,
     default_block_size,
     first_periods,
+    on_both_sides,
     release_time,
     window_of,
     without_hum,
@@ -81,7 +82,11 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     used = window_of(table)
     yield from lint_times(table, used)
     if table.settings.samples == "turning_points":
-        yield from _scales(table, rig, 0.5 / median_step(table["time"][used]), table["x_rel"][used])
+        step, values = median_step(table["time"][used]), table["x_rel"][used]
+        period = 2.0 * step if on_both_sides(values) else step
+        yield from _scales(table, rig, 1.0 / period, values)
+        facts = {"file": table.file, "period": period, "frequency": 1.0 / period}
+        yield from _held(table, [(period == step, "decays.one_side", "ok", facts, ())])
         return
     channels = [name for name in table.columns if name != "time"]
     time = table["time"]
@@ -383,6 +388,14 @@ LINT_MESSAGES = {
         ok=(
             "{file}: the fit uses {means} means of {thin} consecutive samples each instead of {samples} samples. That widens "
             "intervals by {wider} and saves time. To fit every sample, add thin = 1 to the experiment in rig.toml."
+        ),
+    ),
+    "decays.one_side": Message(
+        "turning points of one side",
+        ok=(
+            "{file}: the positions do not change sides, so each row is read as the maximum one period after the last: "
+            "{period:.4g} s, {frequency:.4g} Hz. Where the rows are |x_rel| of both sides, write the sign of each; k1 is "
+            "four times too large without it."
         ),
     ),
     "decays.long": Message(

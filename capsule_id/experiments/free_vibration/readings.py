@@ -178,6 +178,11 @@ def without_hum(time: np.ndarray, values: np.ndarray, hum: float | None) -> np.n
     return values - tone
 
 
+def on_both_sides(values: np.ndarray) -> bool:
+    """Whether turning points (n,) lie on both sides of the rest position in turn; else each is a period after the last."""
+    return bool(np.mean(np.diff(np.sign(np.diff(values))) != 0) > 0.5)
+
+
 # settings: Settings of a free vibration, the model that they state, and the window that contains the free decay.
 
 

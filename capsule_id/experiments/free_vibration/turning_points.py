@@ -31,7 +31,12 @@ from capsule_id.experiments.free_vibration.hidden_terms import (
     sensitivities,
 )
 from capsule_id.experiments.free_vibration.models import half_cycles
-from capsule_id.experiments.free_vibration.readings import DecayModel, decay_window, further_parameters
+from capsule_id.experiments.free_vibration.readings import (
+    DecayModel,
+    decay_window,
+    further_parameters,
+    on_both_sides,
+)
 from capsule_id.experiments.free_vibration.record import Decay, DecayAbout, Screened, force_starts
 from capsule_id.experiments.free_vibration.second_fit import Demanded, replaced
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
@@ -312,8 +317,7 @@ class TurningPoints(Decay):
         time, self.values = decay_window(table)
         self.time = time - time[0]
         step = np.diff(self.time)
-        turns = np.diff(np.sign(np.diff(self.values))) != 0
-        self.both_sides = bool(np.mean(turns) > 0.5)
+        self.both_sides = on_both_sides(self.values)
         index = np.cumsum(np.append(0, np.maximum(1, np.rint(step / np.median(step))))) * (1 if self.both_sides else 2)
         self.index, self.last = index, int(index[-1])
         first = np.sign(self.values[0] - self.values[1]) if self.both_sides else np.sign(self.values[0])
