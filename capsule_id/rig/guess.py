@@ -49,7 +49,7 @@ WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, wor
     "elongacion elongazione distancia distanza amplitude amplitudes peak",
     "x_capsule": "capsule kapsel housing capsula gehause boitier carcasa",
     "x_base": "base shaker basis tisch",
-    "acceleration": "acceleration acc accel accelerometer beschleunigung aceleracion accelerazione a beschl",
+    "acceleration": "acceleration acc accel accelerometer beschleunigung aceleracion accelerazione a beschl gfx gfy gfz",
     "velocity": "velocity speed v v0 geschwindigkeit vitesse velocidad velocita vel geschw",
     "current": "current strom stromstarke i courant corriente corrente intensite intensidad amps coil",
     "force": "force kraft f load friction weight pull fs fk fr fmax fstat fkin reibung fuerza forza "
@@ -101,7 +101,7 @@ SHORTEST_HEAD, SHORT_HEADS = 5, ("weg", "zeit")
 #: How well a name with a number fits, such as x1: it is one of several.
 NUMBERED = 1.5
 #: Units of headers that state none: names that programs give to their columns, and a normal force, or one in N.
-UNITS_OF_NAMES: Mapping[str, str | None] = {"X_Value": "s", "F_N": None}
+UNITS_OF_NAMES: Mapping[str, str | None] = {"X_Value": "s", "F_N": None, "gFx": "g_n", "gFy": "g_n", "gFz": "g_n"}
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*")
 _INSIDE = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*(\S.*)")
 _SEPARATED = re.compile(r"(.*?)(?:\s+/\s*|\s*,\s+|\s+in\s+)([^\s/,]\S*)")
@@ -112,7 +112,7 @@ def unit_of(text: str, dimensions: Sequence[str]) -> str | None:
     written = symbol_named(text.strip())
     for si in dimensions:
         # A lone g beside an acceleration is standard gravity.
-        candidate = "g_n" if written in ("g", "G") and si == "m/s^2" else written
+        candidate = {"g": "g_n", "G": "g_n", "mg": "mg_n"}.get(written, written) if si == "m/s^2" else written
         with suppress(UnitError):
             factor_to_si(candidate, si)
             return candidate
@@ -789,7 +789,7 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
         return by_name, ColumnGuess(index, UNKNOWN, "unsure", missing)
     reason = said if unit == text else f"{said}, read as {unit}"
     return by_name + UNIT_SCORE, ColumnGuess(
-        index, unit, "likely" if unit == "g_n" or named == NUMBERED else "sure", reason
+        index, unit, "likely" if unit in ("g_n", "mg_n") or named == NUMBERED else "sure", reason
     )
 
 

@@ -52,6 +52,7 @@ _DEFINITIONS = {
     "gf": "9.80665e-3 * N",
     "kgf": "9.80665 * N",
     "g_n": "9.80665 * m / s ** 2",
+    "mg_n": "0.00980665 * m / s ** 2",
     "lbf": "4.4482216152605 * N",
     "Ns": "N * s",
     "percent": "0.01",
@@ -71,8 +72,8 @@ _NAMES = {
     "secondi": "s", "metro": "m", "metri": "m", "grad": "deg", "grado": "deg", "gradi": "deg", "degré": "deg",
     "m/s2": "m/s^2", "m/s**2": "m/s^2", "count": "1", "-": "1",
 }  # fmt: skip
-_SYMBOL = re.compile("g_n|[A-Za-z]+")
-_FACTOR = r"(?:(?:g_n|[A-Za-z]+)(?:\^-?[1-4]|⁻?[¹²³⁴])?|1)"
+_SYMBOL = re.compile("m?g_n|[A-Za-z]+")
+_FACTOR = r"(?:(?:m?g_n|[A-Za-z]+)(?:\^-?[1-4]|⁻?[¹²³⁴])?|1)"
 _GRAMMAR = re.compile(rf"{_FACTOR}(?:(?: ?[*/·] ?| ){_FACTOR})*")
 _LONGEST = 40  # characters of a unit
 # A unit that is written more often than the SI unit.

@@ -48,6 +48,8 @@ def written(folder: Path, header: str, rows: int = 8, *, constant: str = "") -> 
         ("dynamic_friction", "d_mm,v0 (m/s)", {"speed": ("v0 (m/s)", "m/s"), "distance": ("d_mm", "mm")}),
         ("static_friction", "angle_deg", {"angle": ("angle_deg", "deg")}),
         ("free_vibration", "Time (s),Acc (g)", {"time": ("Time (s)", "s"), "acceleration": ("Acc (g)", "g_n")}),
+        ("free_vibration", "Time (s),Acc (mg)", {"time": ("Time (s)", "s"), "acceleration": ("Acc (mg)", "mg_n")}),
+        ("free_vibration", "time,gFz", {"time": ("time", "?"), "acceleration": ("gFz", "g_n")}),
         ("free_vibration", "Acc (V),Time (s)", {"time": ("Time (s)", "s"), "x_rel": ("?", "?")}),
         ("free_vibration", "Time (s),Disp ( V )", {"time": ("Time (s)", "s"), "x_rel": ("?", "?")}),
         ("static_friction", "mass [kg],force [N]", {"force": ("force [N]", "N")}),
