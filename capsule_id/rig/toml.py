@@ -244,7 +244,8 @@ _LONGEST_SHOWN = 60  # characters of a faulty value in an error line
 _ALIASES = {
     "mass1": "m1", "mass_1": "m1", "rod_mass": "m1", "mass2": "m2", "mass_2": "m2", "capsule_mass": "m2", "gravity": "g",
     "uncertainty": "sd", "error": "sd", "sigma": "sd", "std": "sd", "stdev": "sd", "val": "value", "units": "unit",
-    "type": "kind", "path": "file", "filename": "file", "title": "name", "na": "missing", "missing_values": "missing",
+    "type": "kind", "path": "file", "filename": "file", "title": "name", "name": "label", "column": "from",
+    "header": "from", "na": "missing", "missing_values": "missing",
 }  # fmt: skip
 
 
@@ -354,7 +355,7 @@ class Node:
         for key in self.value:
             if key not in known:
                 table = next((name for name, keys in (elsewhere or {}).items() if key in keys), None)
-                remedy = f"move it to {table}" if table else remedy_for(key, known, "remove it", "write {}")
+                remedy = remedy_for(key, known, f"move it to {table}" if table else "remove it", "write {}")
                 faults.append(
                     self[key].error("unknown key", shown(key), f"{remedy}; known: {' '.join(known)}", of_key=True)
                 )

@@ -28,6 +28,8 @@ TOML_FAULTS = [
         "unknown key, 'friction', move it to [model]; known: name synthetic",
     ),
     ('kind = "static_friction"', 'kind = "static_friction"\n‸free = []', "unknown key, 'free', move it to [model]"),
+    # Before: "move it to [rig]", which has a name.
+    ('kind = "static_friction"', 'kind = "static_friction"\n‸name = "a"', "unknown key, 'name', write label"),
     ('m1 = { value = 110, sd = 0.5, unit = "g" }', "m1 = ‸0.11", "m1 must be a table"),
     ("g = { value = 9.81,", "g = { value = 9.81, ‸sd = 0.01,", "unknown key, 'sd', remove it"),
     ("m1 = { value = 110", "m1 = { value = ‸-110", "m1 must be greater than 0"),
