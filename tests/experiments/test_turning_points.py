@@ -372,6 +372,19 @@ def test_amplitudes_of_one_side_have_no_frequency_of_a_record() -> None:
     assert "decays.frequency" not in codes
 
 
+def test_the_errors_of_readings_are_said_of_what_these_alone_inform() -> None:
+    """A record beside them informs c too, and what a zero of its sensor does there is not known."""
+    time = np.arange(400) / 1000.0
+    x = bench.released(time, 2e-3) + 1e-3 * np.random.default_rng(4).standard_normal(400)
+    turns = bench.table("free_vibration", _viscous_turns(2e-3, one_side=True), "turns", samples="turning_points")
+    record = bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)], "record")
+    said = [
+        cid.fit(bench.rig(*tables), budget=None).summary["largest_error"]["c"] for tables in ([turns], [turns, record])
+    ]
+    assert said[0].endswith(": zero of x_rel")
+    assert said[1] == "1 %: clock"
+
+
 def test_how_amplitudes_of_one_side_are_read_is_said() -> None:
     """|x_rel| of every swing looks like the maxima of a spring four times as stiff, and was trusted without a word."""
     period = 2.0 * np.pi / float(np.sqrt(bench.K1 / bench.M1 - (bench.C / (2.0 * bench.M1)) ** 2))
