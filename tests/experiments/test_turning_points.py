@@ -385,16 +385,19 @@ def test_the_errors_of_readings_are_said_of_what_these_alone_inform() -> None:
     assert said[1] == "1 %: clock"
 
 
-def test_how_amplitudes_of_one_side_are_read_is_said() -> None:
-    """|x_rel| of every swing looks like the maxima of a spring four times as stiff, and was trusted without a word."""
+def test_amplitudes_of_one_side_need_a_word_on_how_they_were_read() -> None:
+    """Before: |x_rel| of every swing, as maxima of a spring four times as stiff, gave k1 trusted without a word."""
     period = 2.0 * np.pi / float(np.sqrt(bench.K1 / bench.M1 - (bench.C / (2.0 * bench.M1)) ** 2))
     for one_side in (False, True):
         rig = bench.rig(bench.table("free_vibration", _viscous_turns(2e-3, one_side), samples="turning_points"))
+        label = rig.tables[0].label
         said = [found for found in lint(rig, default_registry(), rig.tables) if found.code == "decays.one_side"]
-        assert [found.level for found in said] == ["ok"] * one_side
+        assert [(found.level, found.parameters) for found in said] == [("warn", ("k1",))] * one_side
         for found in said:
             assert found.facts["period"] == pytest.approx(period, rel=1e-3)
-            assert "write the sign of each" in finding_text(found, messages_of(default_registry()))
+            assert f'confirmed = ["{label}.samples"]' in finding_text(found, messages_of(default_registry()))
+        stated = replace(rig, confirmed=(f"{label}.samples",))
+        assert not [found for found in lint(stated, default_registry(), rig.tables) if found.code == "decays.one_side"]
 
 
 def test_a_stated_hum_is_no_release() -> None:

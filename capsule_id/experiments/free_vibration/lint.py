@@ -85,8 +85,10 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         step, values = median_step(table["time"][used]), table["x_rel"][used]
         period = 2.0 * step if on_both_sides(values) else step
         yield from _scales(table, rig, 1.0 / period, values)
-        facts = {"file": table.file, "period": period, "frequency": 1.0 / period}
-        yield from _held(table, [(period == step, "decays.one_side", "ok", facts, ())])
+        scales = (f"{table.label}.samples",)
+        facts = {"file": table.file, "period": period, "frequency": 1.0 / period, "scales": scales}
+        unsaid = period == step and scales[0] not in rig.confirmed
+        yield from _held(table, [(unsaid, "decays.one_side", "warn", facts, ("k1",))])
         return
     channels = [name for name in table.columns if name != "time"]
     time = table["time"]
@@ -392,10 +394,11 @@ LINT_MESSAGES = {
     ),
     "decays.one_side": Message(
         "turning points of one side",
-        ok=(
+        warn=(
             "{file}: the positions do not change sides, so each row is read as the maximum one period after the last: "
             "{period:.4g} s, {frequency:.4g} Hz. Where the rows are |x_rel| of both sides, write the sign of each; k1 is "
-            "four times too large without it."
+            "four times too large without it, so it is not judged. Where they are maxima of successive periods, write this "
+            "line in [rig] of rig.toml: {line}"
         ),
     ),
     "decays.long": Message(
