@@ -140,6 +140,8 @@ COST_RATIO_TO_ABANDON = 3.0
 TOGETHER = 2
 #: Try starts until two of them fit every channel within this many times its noise, or so many end at the same maximum.
 NOISE_RATIO_OF_A_GOOD_FIT, ENOUGH_THAT_AGREE = 1.2, 4
+#: Ends whose excess noise is so close to the smallest have the same misfit: it is that of the model, not of a wrong maximum.
+SAME_MISFIT = 1.02
 #: Factors by which a scatter moves together with what it multiplies.
 FACTORS = np.geomspace(0.1, 10.0, 32)
 
@@ -235,18 +237,23 @@ def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
 
 
 def _suffice(target: LogPosterior, ends: list[_End], highest: float) -> bool:
-    """Whether further starts are not needed: two fit every channel, or many reach the ``highest`` log-posterior."""
+    """Whether further starts are not needed.
+
+    Two ends fit every channel, many reach the ``highest`` log-posterior, or ``STARTS`` of them have the same misfit.
+    """
     if len(ends) < STARTS:
         return False
     if sum(end.value > highest - NEGLIGIBLE_INCREASE for end in ends) >= ENOUGH_THAT_AGREE:
         return True
-    return sum(not _has_excess_noise(target, end.u) for end in ends) > 1
+    excess = np.array([_excess_noise(target, end.u) for end in ends])
+    misfit = max(float(np.min(excess)), NOISE_RATIO_OF_A_GOOD_FIT)
+    return bool(np.sum(excess <= NOISE_RATIO_OF_A_GOOD_FIT) > 1 or np.sum(excess < SAME_MISFIT * misfit) >= STARTS)
 
 
-def _has_excess_noise(target: LogPosterior, u: np.ndarray) -> bool:
-    """Whether the residuals of a record at u (d,) exceed its noise level: the model does not fit its motion."""
+def _excess_noise(target: LogPosterior, u: np.ndarray) -> float:
+    """Largest ratio of the residuals of a record at u (d,) to its noise level; above 1 the model does not fit its motion."""
     values = target.mapping(target.theta(u))
-    return any(e.excess_noise(e.local(values)) > NOISE_RATIO_OF_A_GOOD_FIT for e in target.experiments)
+    return max(e.excess_noise(e.local(values)) for e in target.experiments)
 
 
 def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:

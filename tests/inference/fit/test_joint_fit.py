@@ -1,5 +1,6 @@
 """Bench and runs fitted together, small: against the truth, against SciPy, and what smoothing would have done."""
 
+import itertools
 import signal
 import threading
 import time
@@ -172,10 +173,26 @@ def test_starts_end_where_enough_of_them_agree(monkeypatch: pytest.MonkeyPatch) 
     target, fit = fitted()
     good = _descend(target, fit.u)
     lower = replace(good, value=good.value - 1.0)
-    monkeypatch.setattr(module, "_has_excess_noise", lambda *_: True)
+    growing = itertools.count(2)
+    monkeypatch.setattr(module, "_excess_noise", lambda *_: next(growing))
     assert _suffice(target, [good] * 4, good.value)
     assert not _suffice(target, [good, good, good, lower, lower], good.value)
     assert not _suffice(target, [lower] * 4 + [good], good.value)
+
+
+def test_starts_end_where_the_data_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three ends with one misfit: it is that of the data. (Before: eight starts, minutes.) Wrong maxima have different ones."""
+    target, fit = fitted()
+    good = _descend(target, fit.u)
+    ends = [replace(good, value=good.value - 10.0 * i) for i in range(4)]
+    for excess, enough in (
+        ((180.1, 180.4, 180.0), True),
+        ((180.1, 240.0, 180.0), False),
+        ((180.1, 90.0, 180.0, 181.0), False),
+    ):
+        found = iter(excess)
+        monkeypatch.setattr(module, "_excess_noise", lambda *_, found=found: next(found))
+        assert _suffice(target, ends[: len(excess)], good.value) == enough
 
 
 def test_a_move_of_one_parameter_leads_out_of_a_side_maximum_and_not_out_of_the_maximum() -> None:
