@@ -69,6 +69,14 @@ def _slope(x: np.ndarray, y: np.ndarray) -> float:
 RELATIONS = (
     (("force", "current"), "force per current", "N/A", _slope, (0.03, 300.0), MOTOR_ALONE),
     (("force", "deflection"), "force per deflection", "N/m", _slope, (0.0, np.inf), SPRING_ALONE),
+    # A load in kg that is taken for N makes the friction 9.81 times too large, and fits as well.
+    (
+        ("force", "normal_force"),
+        "force over normal force",
+        "1",
+        lambda x, y: float(np.median(x / y)),
+        *2 * [(0.02, 2.0)],
+    ),
     (
         ("speed", "distance"),
         "speed^2/(2 g distance)",

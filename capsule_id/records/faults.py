@@ -1,6 +1,7 @@
 """Finds faults of a record: aliasing, bursts, mislabelled channels, clipping, copies, lost samples, bad times."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -151,8 +152,10 @@ class Phasor:
     sd: float
 
 
-def phasor(time: np.ndarray, values: np.ndarray, Omega: float) -> Phasor:
-    """Amplitude of the tone at ``Omega``, rad/s, over whole periods at the end of a record, beside a linear trend.
+def phasor(time: np.ndarray, values: np.ndarray, Omega: float, harmonics: Sequence[int] = (1,)) -> Phasor:
+    """Amplitude of the first of the ``harmonics`` of ``Omega``, rad/s, over whole periods of that at the end of a record.
+
+    It stands beside a linear trend and the other harmonics, which the trend would mix with it.
 
     Parameters
     ----------
@@ -162,7 +165,8 @@ def phasor(time: np.ndarray, values: np.ndarray, Omega: float) -> Phasor:
     whole = np.floor((time[-1] - time[0]) / period) * period
     last = time >= time[-1] - whole
     t, x = time[last], values[last]
-    design = np.stack([np.cos(Omega * t), np.sin(Omega * t), np.ones_like(t), t - t[0]], axis=1)
+    tones = [wave(k * Omega * t) for k in dict.fromkeys(harmonics) for wave in (np.cos, np.sin)]
+    design = np.stack([*tones, np.ones_like(t), t - t[0]], axis=1)
     cosine, sine, *_ = np.linalg.lstsq(design, x)[0]
     noise = noise_level(x, 6) if len(x) >= FEWEST_SAMPLES else float(np.std(x))
     return Phasor(complex(cosine, -sine), noise * float(np.sqrt(2.0 / len(x))))

@@ -238,7 +238,10 @@ def lasting_tone(time: Record, values: Record, own: float) -> float:
     multiple = np.clip(np.round(f / own), 1.0, MULTIPLES)
     apart = np.where((f > width) & (np.abs(f - multiple * own) > width), power, 0.0)
     best = int(np.argmax(apart))
-    if not apart[best] > PROMINENT * np.median(power):
+    off = np.abs(f - f[best])
+    # Beside the empty stop band of a filtered record any of its noise stands out; beside its neighbours a tone does.
+    around = power[(off > 2.0 * width) & (off < max(6.0 * width, 0.35 * f[best]))]
+    if not apart[best] > PROMINENT * max(np.median(power), np.median(around)):
         return 0.0
     Omega = _refine(time, values, 2.0 * np.pi * float(f[best]))[0]
     found, half = Omega / (2.0 * np.pi), len(time) // 2

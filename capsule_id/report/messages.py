@@ -146,9 +146,10 @@ def _modes(facts: Facts) -> str:
 def _tails(facts: Facts) -> str:
     """The parameters whose priors pull, and those of them whose prior can be stated."""
     seen = f"{facts['names']} ended in the tail of the prior, which pulls the estimate."
+    check = "Check the values and units of the readings and of rig.toml"
     if not facts["keys"]:
-        return f"{seen} Check the values and units of the readings and of rig.toml."
-    return f"{seen} In [prior] state a wider or better placed prior of {facts['keys']}."
+        return f"{seen} {check}."
+    return f"{seen} {check}; if they are right, state in [prior] a wider or better placed prior of {facts['keys']}."
 
 
 _SMOOTHED = (
@@ -179,12 +180,15 @@ def _chains(facts: Facts) -> str:
 
 def _unusual(facts: Facts) -> str:
     """The number, the usual interval, the unit that was probably meant, and the line that confirms the number."""
-    of, unit = "times are" if "period" in facts["name"] else "number is", "" if facts["unit"] == "1" else facts["unit"]
+    of, unit = (
+        "times are" if "period" in facts["name"] else "number is",
+        "" if facts["unit"] == "1" else f" {facts['unit']}",
+    )
     meant = f" If the {of} in {facts['meant']}, write that unit." if facts["meant"] else ""
     scales = " and ".join(facts.get("scales", [facts["name"]]))
     line = f" If it is right, write this line in [rig] of rig.toml: {facts['line']}" if "line" in facts else ""
     return (
-        f"{facts['name']} is {facts['value']:.4g} {unit}; {facts['low']:.3g} to {facts['high']:.3g} {unit} is usual. Check "
+        f"{facts['name']} is {facts['value']:.4g}{unit}; {facts['low']:.3g} to {facts['high']:.3g}{unit} is usual. Check "
         f"the unit of {scales}.{meant} What it scales is not judged.{line}"
     )
 

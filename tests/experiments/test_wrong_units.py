@@ -324,3 +324,15 @@ def test_an_amplitude_or_gap_whose_prior_reaches_below_0_is_named() -> None:
     ]
     assert "gap is 0.001 ± 0.0008" in named(gap=Quantity(1e-3, 8e-4))[0]
     assert named(gap=Quantity(0.0, 2e-5)) == []
+
+
+def test_loads_in_kg_that_are_taken_for_newtons_are_named() -> None:
+    """Before: mu 9.81 times too large, trusted. The control: the same pulls with their loads in N."""
+    load = np.repeat([0.5, 1.0, 2.0], 4)
+    force = 0.25 * 9.81 * load * (1.0 + 0.01 * np.random.default_rng(1).standard_normal(12))
+    for factor, level in ((1.0, "warn"), (9.81, None)):
+        columns = [bench.column("force", force), bench.column("normal_force", factor * load)]
+        rig = bench.rig(bench.table("static_friction", columns, "pulls"))
+        found = [f for f in lint(rig, default_registry(), rig.tables) if f.code == "readings.magnitude"]
+        assert [f.level for f in found] == ([] if level is None else [level])
+        assert all(f.facts["scales"] == ("pulls.force", "pulls.normal_force") for f in found)

@@ -17,6 +17,7 @@ from capsule_id.records.faults import (
     find_gaps,
     frozen_samples,
     jump_or_noise,
+    phasor,
     time_rounding,
 )
 from tests.experiments.bench import K1, M1, C, released
@@ -307,3 +308,12 @@ def test_pairs_that_share_no_window_are_not_compared(coarse: float, monkeypatch:
     monkeypatch.setattr(duplicates, "_candidates", lambda *_: pairs)
     assert found == repeated_blocks(tables)
     assert len(found) >= (1 if coarse == 1.0 else 3)
+
+
+def test_a_harmonic_is_told_from_the_drive_and_a_trend() -> None:
+    """8.8 periods of the drive. Before: 2 % of the drive in a harmonic that is not there, and right columns named wrong."""
+    time, Omega = np.arange(1600) / 1000.0, 34.5
+    x = 1e-3 * np.cos(Omega * time + 0.3) + 2e-4 * time + 1e-7 * np.random.default_rng(1).standard_normal(1600)
+    found = phasor(time, x + 1e-6 * np.cos(2.0 * Omega * time), Omega, (2, 1, 3))
+    assert abs(found.value - 1e-6) < 5.0 * found.sd
+    assert abs(phasor(time, x, 2.0 * Omega).value) > 100.0 * found.sd

@@ -225,7 +225,8 @@ def _columns(table: Table[Any]) -> Iterable[Finding]:
         low, high = OF_DERIVATIVE if "x_capsule" in whole else RATIO_OF_X_REL
         for harmonic in HARMONICS if "x_capsule" in whole else HARMONICS[:1]:
             frequency = harmonic * Omega
-            moves, accelerates = phasor(time, position, frequency), phasor(time, whole["acceleration_rod"], frequency)
+            order = (harmonic, *HARMONICS)
+            moves, accelerates = (phasor(time, x, Omega, order) for x in (position, whole["acceleration_rod"]))
             expected = frequency**2 * abs(moves.value)
             strong = max(expected, abs(accelerates.value)) > STRONG * float(np.std(whole["acceleration_rod"]))
             ratio = derivative_ratio(moves, accelerates, frequency, 2)
